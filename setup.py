@@ -110,7 +110,9 @@ class BuildKernels(build_ext):
         later `pip install -e` would compile all kernels again.
         """
         if self.inplace or self.editable_mode:
-            self.distribution.ext_modules += map(extension, sorted(Path("benchmarks").rglob("*.pyx")))
+            self.distribution.ext_modules += map(
+                extension, sorted(Path("benchmarks").rglob("*.pyx"))
+            )
         if self.editable_mode:
             folders = build(self.distribution)
             folders.ensure_finalized()
@@ -123,7 +125,18 @@ class BuildKernels(build_ext):
         out = Path("build", "cython")
         stamp = out / "how.json"
         how = json.dumps(
-            [Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS, INLINE, LIMITS, HOT, FAST, COLD]
+            [
+                Cython.__version__,
+                SHARED,
+                DIRECTIVES,
+                COMPILE_ARGS,
+                LINK_ARGS,
+                INLINE,
+                LIMITS,
+                HOT,
+                FAST,
+                COLD,
+            ]
         )
         current = stamp.exists() and stamp.read_text() == how
         if not current:
@@ -215,11 +228,15 @@ class BuildWasm(Command):
             if reason:
                 self.announce(f"no WebAssembly module {name}: {reason}", level=logging.INFO)
             else:
-                WASM["build"](out, Path().resolve(), part.modules, imports_memory=part.imports_memory)
+                WASM["build"](
+                    out, Path().resolve(), part.modules, imports_memory=part.imports_memory
+                )
 
     def get_outputs(self):
         """Return the paths of the modules that were built."""
-        modules = (Path(self.build_lib, "lavender", "sim", "web", f"{name}.wasm") for name in WASM["PARTS"])
+        modules = (
+            Path(self.build_lib, "lavender", "sim", "web", f"{name}.wasm") for name in WASM["PARTS"]
+        )
         return [str(out) for out in modules if out.exists()]
 
     def get_output_mapping(self):
@@ -273,7 +290,9 @@ class BuildLibrary(Command):
 def make_library():
     """Bring lavender/export/c/lavender.c up to date with the kernels and return its path."""
     out = Path("lavender", "export", "c", "lavender.c")
-    if not (out.exists() and LIBRARY["hash_sources"](Path()) in out.read_text(encoding="utf-8")[:1000]):
+    if not (
+        out.exists() and LIBRARY["hash_sources"](Path()) in out.read_text(encoding="utf-8")[:1000]
+    ):
         put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
     return out
 
@@ -291,14 +310,17 @@ class ReproducibleArchive(sdist):
                     raise CompileError(
                         f"a source distribution contains {path}, which cannot be built here: {reason}"
                     )
-                WASM["build"](path, Path().resolve(), part.modules, imports_memory=part.imports_memory)
+                WASM["build"](
+                    path, Path().resolve(), part.modules, imports_memory=part.imports_memory
+                )
         super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002
         """Make a reproducible archive (`gztar`, the format of frontends) and return its path."""
         if format != "gztar":
             return super().make_archive(base_name, format, root_dir, base_dir, owner, group)
-        out, epoch = Path(f"{base_name}.tar.gz"), int(os.environ["SOURCE_DATE_EPOCH"])
+        out = Path(f"{base_name}.tar.gz")
+        epoch = int(os.environ["SOURCE_DATE_EPOCH"])
         out.parent.mkdir(parents=True, exist_ok=True)
         top = Path(root_dir or ".", base_dir)
         with (
@@ -308,7 +330,8 @@ class ReproducibleArchive(sdist):
         ):
             for path in sorted((p for p in top.rglob("*") if p.is_file()), key=Path.as_posix):
                 entry = tarfile.TarInfo(f"{base_dir}/{path.relative_to(top).as_posix()}")
-                entry.size, entry.mtime = path.stat().st_size, epoch
+                entry.size = path.stat().st_size
+                entry.mtime = epoch
                 entry.mode = 0o755 if path.stat().st_mode & 0o100 else 0o644
                 with path.open("rb") as data:
                     archive.addfile(entry, data)
@@ -344,13 +367,23 @@ FILES_URL = os.environ.get("LAVENDER_FILES_URL", "").rstrip("/")
 def long_description():
     """Return README.md, with absolute links and pictures if LAVENDER_FILES_URL is set."""
     text = Path("README.md").read_text(encoding="utf-8")
-    return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({FILES_URL}/\1)", text) if FILES_URL else text
+    return (
+        re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({FILES_URL}/\1)", text) if FILES_URL else text
+    )
 
 
 def project_urls():
     """Return `[project.urls]`, below LAVENDER_FILES_URL; none if it is not set."""
-    pages = {"Documentation": "docs/index.md", "Changelog": "CHANGELOG.md", "Citation": "CITATION.cff"}
-    return {"Source": FILES_URL} | {k: f"{FILES_URL}/{p}" for k, p in pages.items()} if FILES_URL else {}
+    pages = {
+        "Documentation": "docs/index.md",
+        "Changelog": "CHANGELOG.md",
+        "Citation": "CITATION.cff",
+    }
+    return (
+        {"Source": FILES_URL} | {k: f"{FILES_URL}/{p}" for k, p in pages.items()}
+        if FILES_URL
+        else {}
+    )
 
 
 setup(

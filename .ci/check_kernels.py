@@ -31,7 +31,14 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 
 #: Standard C: compiler extensions only with a guard, no variable-length arrays (MSVC does not support them).
 #: Overlong strings are permitted: Cython writes a module's Python names as one string.
-DIALECT = ["-std=c11", "-pedantic", "-Wvla", "-Wall", "-Wno-unused-function", "-Wno-overlength-strings"]
+DIALECT = [
+    "-std=c11",
+    "-pedantic",
+    "-Wvla",
+    "-Wall",
+    "-Wno-unused-function",
+    "-Wno-overlength-strings",
+]
 #: Selects the branch without vector types of every `#if defined(__GNUC__)` in the kernels.
 PLAIN = ["-DLAVENDER_ONE_LANE"]
 #: Warning from code that Cython writes into each module: function tables for other modules, as object pointers.
@@ -77,11 +84,16 @@ def read_source(path: Path) -> list[str]:
             breaches.append(f"{name}: must be declared noexcept nogil")
         declarations = [f"{match['head']} {name}", *filter(str.strip, match["args"].split(","))]
         for declaration in declarations:
-            kind, shown = type_of(declaration), " ".join(declaration.split())
+            kind = type_of(declaration)
+            shown = " ".join(declaration.split())
             if "[" in declaration or kind in NOT_FIXED or not FIXED.match(kind):
-                breaches.append(f"{name}: '{shown}' is not of a fixed-width type or a pointer to one")
+                breaches.append(
+                    f"{name}: '{shown}' is not of a fixed-width type or a pointer to one"
+                )
             elif kind.endswith("int64_t") and "*" not in declaration:
-                breaches.append(f"{name}: '{shown}' passes a 64-bit integer by value (JavaScript: BigInt)")
+                breaches.append(
+                    f"{name}: '{shown}' passes a 64-bit integer by value (JavaScript: BigInt)"
+                )
     return breaches
 
 
@@ -89,8 +101,12 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
     """Return the standard output of a command; raise RuntimeError with the end of its messages if it fails."""
     done = subprocess.run(
         [str(part) for part in command],
-        cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=cwd,
+        env={**os.environ, **env},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         shown = shlex.join(map(str, command))
         said = (done.stdout + done.stderr)[-3000:]
@@ -105,7 +121,9 @@ def read_dialect(c_file: Path) -> list[str]:
     found: dict[str, None] = {}
     text = c_file.read_text(encoding="utf-8")
     guarded = PLAIN[0].removeprefix("-D") in text or '"lanes.h"' in text
-    for more in ([], PLAIN) if guarded else ([],):  # without the guard both compilations are the same
+    for more in (
+        ([], PLAIN) if guarded else ([],)
+    ):  # without the guard both compilations are the same
         command = [
             *compiler,
             *OPTIONS["COMPILE_FLAGS"],
@@ -118,8 +136,12 @@ def read_dialect(c_file: Path) -> list[str]:
         done = subprocess.run(
             command, capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"}
         )
-        lines = [line for line in done.stderr.splitlines() if re.search(r"\b(warning|error):", line)]
-        found.update(dict.fromkeys(line.partition(": ")[2] for line in lines if CYTHONS_OWN not in line))
+        lines = [
+            line for line in done.stderr.splitlines() if re.search(r"\b(warning|error):", line)
+        ]
+        found.update(
+            dict.fromkeys(line.partition(": ")[2] for line in lines if CYTHONS_OWN not in line)
+        )
         if done.returncode and not found:
             raise RuntimeError(f"{shlex.join(command)} failed:\n{done.stderr}")
     return [f"not strict C11: {text}" for text in found]

@@ -12,20 +12,40 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-TEXTS = re.compile(r'"""[\s\S]*?"""|\'\'\'[\s\S]*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|#[^\n]*')
+TEXTS = re.compile(
+    r'"""[\s\S]*?"""|\'\'\'[\s\S]*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|#[^\n]*'
+)
 #: Statements without a computation that a fault could change.
 SKIPPED = re.compile(
     r"(async def|def|cpdef|ctypedef|class|import|from|cimport|raise|assert|pass|global|@|[\w.]+: [\w\[\]]+ = field)\b|@"
 )
 #: Statements of kernels that declare; one with a value may be changed right of "=".
-DECLARATION = re.compile(r"cdef\b(?!.*[^=!<>]=[^=])|cdef (inline|class|struct|enum|extern|cppclass)\b")
+DECLARATION = re.compile(
+    r"cdef\b(?!.*[^=!<>]=[^=])|cdef (inline|class|struct|enum|extern|cppclass)\b"
+)
 NAME = r"[A-Za-z_][\w.]*"
 BOUNDS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
 PAIRS = {
-    "_a": "_b", "_b": "_a", "lower": "upper", "upper": "lower", "low": "high", "high": "low", "first": "last",
-    "last": "first", "min": "max", "max": "min", "fmin": "fmax", "fmax": "fmin", "row": "column", "any": "all",
-    "all": "any", "and": "or", "or": "and", "True": "False", "False": "True",
-}  # fmt: skip
+    "_a": "_b",
+    "_b": "_a",
+    "lower": "upper",
+    "upper": "lower",
+    "low": "high",
+    "high": "low",
+    "first": "last",
+    "last": "first",
+    "min": "max",
+    "max": "min",
+    "fmin": "fmax",
+    "fmax": "fmin",
+    "row": "column",
+    "any": "all",
+    "all": "any",
+    "and": "or",
+    "or": "and",
+    "True": "False",
+    "False": "True",
+}
 
 
 class Place(NamedTuple):
@@ -41,17 +61,28 @@ class Place(NamedTuple):
 #: Name of each operator: its pattern in code without texts, and the text in place of a match.
 OPERATORS: dict[str, tuple[re.Pattern[str], Callable[[re.Match[str]], str]]] = {
     "sign": (
-        re.compile(r"(?<=[\w)\]] )[+-](?= [\w(<&-])|(?<= )[+-](?==)|(?:(?<=\()|(?<=[=(,] ))-(?=[A-Za-z(])"),
+        re.compile(
+            r"(?<=[\w)\]] )[+-](?= [\w(<&-])|(?<= )[+-](?==)|(?:(?<=\()|(?<=[=(,] ))-(?=[A-Za-z(])"
+        ),
         lambda m: {"+": "-", "-": "+"}[m[0]] if m.string[m.end() : m.end() + 1] in " =" else "",
     ),
     "bound": (re.compile(r"(?<= )(<=|>=|==|!=|<|>)(?= )"), lambda m: BOUNDS[m[0]]),
     "row": (
-        re.compile(r"(?<=\[)\d(?=[\],])|(?<=\[)[^\[\]]*(?<= )\+ \d+(?=\])|(?<=range\()(?=[\w.]+\))"),
-        lambda m: "1, " if not m[0] else str(1 - int(m[0]) if m[0] in "01" else int(m[0]) - 1) if m[0].isdigit()
-        else re.sub(r" \+ \d+$", "", m[0]),
+        re.compile(
+            r"(?<=\[)\d(?=[\],])|(?<=\[)[^\[\]]*(?<= )\+ \d+(?=\])|(?<=range\()(?=[\w.]+\))"
+        ),
+        lambda m: (
+            "1, "
+            if not m[0]
+            else str(1 - int(m[0]) if m[0] in "01" else int(m[0]) - 1)
+            if m[0].isdigit()
+            else re.sub(r" \+ \d+$", "", m[0])
+        ),
     ),
     "other of a pair": (
-        re.compile(r"(?<=\w)_[ab]\b|\b(lower|upper|low|high|first|last|f?min|f?max|row|any|all|and|or|True|False)\b(?!=)"),
+        re.compile(
+            r"(?<=\w)_[ab]\b|\b(lower|upper|low|high|first|last|f?min|f?max|row|any|all|and|or|True|False)\b(?!=)"
+        ),
         lambda m: PAIRS[m[0]],
     ),
     "swapped arguments": (
@@ -59,7 +90,9 @@ OPERATORS: dict[str, tuple[re.Pattern[str], Callable[[re.Match[str]], str]]] = {
         lambda m: f"{m[2]}, {m[1]}" if m[1] else f"{m[4]}, {m[3]}",
     ),
     "dropped branch": (
-        re.compile(r"(?<=^)(?:\s*(?:el)?if )(?!TYPE_CHECKING)[^:]+(?=:\s*$)|(?<= )and [^:()]+(?=:\s*$)"),
+        re.compile(
+            r"(?<=^)(?:\s*(?:el)?if )(?!TYPE_CHECKING)[^:]+(?=:\s*$)|(?<= )and [^:()]+(?=:\s*$)"
+        ),
         lambda m: "" if m[0].startswith("and ") else m[0][: m[0].index("if ") + 3] + "False",
     ),
     "stale state": (
@@ -73,7 +106,7 @@ OPERATORS: dict[str, tuple[re.Pattern[str], Callable[[re.Match[str]], str]]] = {
         ),
         lambda m: "NULL" if m[0] == "deadline" else "1.0" if m[0].startswith("1.0") else "",
     ),
-}  # fmt: skip
+}
 
 
 def mask_texts(text: str) -> str:
@@ -83,7 +116,8 @@ def mask_texts(text: str) -> str:
 
 def list_code_lines(text: str) -> Iterator[tuple[int, str, bool]]:
     """Yield (number, code, whether it is a whole statement) of the lines with statements that may be changed."""
-    depth, is_skipped = 0, False
+    depth = 0
+    is_skipped = False
     for number, code in enumerate(mask_texts(text).splitlines()):
         before = depth
         depth += sum(map(code.count, "([{")) - sum(map(code.count, ")]}"))
@@ -96,9 +130,13 @@ def list_code_lines(text: str) -> Iterator[tuple[int, str, bool]]:
 def read_types(text: str) -> dict[str, set[str]]:
     """Return the types with which each name is declared in a file."""
     types = defaultdict[str, set[str]](set)
-    for m in re.finditer(r"\b(\w+): ([\w\[\], |.]+?)(?=,? *\w+: |, \*|\)| =|$)", text, re.MULTILINE):
+    for m in re.finditer(
+        r"\b(\w+): ([\w\[\], |.]+?)(?=,? *\w+: |, \*|\)| =|$)", text, re.MULTILINE
+    ):
         types[m[1]].add(m[2])
-    for m in re.finditer(r"(?:cdef|[(,]) *(?:const )?(\w+\*?) \**(\w+(?:, \w+)*)(?=[,)=\n ])", text):
+    for m in re.finditer(
+        r"(?:cdef|[(,]) *(?:const )?(\w+\*?) \**(\w+(?:, \w+)*)(?=[,)=\n ])", text
+    ):
         for name in m[2].split(", "):
             types[name].add(m[1])
     return types
@@ -107,7 +145,8 @@ def read_types(text: str) -> dict[str, set[str]]:
 def list_places(path: str, text: str, lines: set[int] | None = None) -> dict[str, list[Place]]:
     """Return the places of each operator in a file; `lines` selects some of its lines, counted from 0."""
     places = defaultdict[str, list[Place]](list)
-    own, types = text.splitlines(), read_types(text)
+    own = text.splitlines()
+    types = read_types(text)
     for number, code, is_whole in list_code_lines(text):
         if lines is not None and number not in lines:
             continue
@@ -129,7 +168,8 @@ def draw_places(
     places: dict[str, list[Place]], count: int, rng: random.Random
 ) -> Iterator[tuple[str, Place]]:
     """Yield (operator, place): operators in turn in a random order, each line once."""
-    order, used = sorted(places), set[tuple[str, int]]()
+    order = sorted(places)
+    used = set[tuple[str, int]]()
     rng.shuffle(order)
     pools = {operator: rng.sample(places[operator], len(places[operator])) for operator in order}
     for turn in range(len(order) * count):
@@ -145,17 +185,21 @@ def draw_places(
 def make_lines(text: str, place: Place) -> list[str]:
     """Return the lines of a fault, with as many lines around the change as make them unique in the file."""
     own = text.splitlines()
-    stripped, old = [line.strip() for line in own], own[place.line]
+    stripped = [line.strip() for line in own]
+    old = own[place.line]
     changed = f"{old[: place.begin]}{place.text}{old[place.end :]}".rstrip()
     for margin in range(1, len(own)):
-        begin, end = max(place.line - margin, 0), min(place.line + margin + 1, len(own))
+        begin = max(place.line - margin, 0)
+        end = min(place.line + margin + 1, len(own))
         block = stripped[begin:end]
         if sum(stripped[k : k + len(block)] == block for k in range(len(own))) == 1:
             break
     return [
-        *(f" {line}" for line in own[begin : place.line]), f"-{old}", f"+{changed}",
+        *(f" {line}" for line in own[begin : place.line]),
+        f"-{old}",
+        f"+{changed}",
         *(f" {line}" for line in own[place.line + 1 : end]),
-    ]  # fmt: skip
+    ]
 
 
 def draw_faults(
@@ -167,14 +211,18 @@ def draw_faults(
     """
     rng = random.Random(seed)
     for folder, suffixes, share in (
-        ("lavender", {".py"}, count - count // 2), ("lavender_ext", {".pyx", ".pxd"}, count // 2),
-    ):  # fmt: skip
-        places, texts = defaultdict[str, list[Place]](list), dict[str, str]()
+        ("lavender", {".py"}, count - count // 2),
+        ("lavender_ext", {".pyx", ".pxd"}, count // 2),
+    ):
+        places = defaultdict[str, list[Place]](list)
+        texts = dict[str, str]()
         for path in sorted((root / folder).rglob("*")):
             name = path.relative_to(root).as_posix()
             if path.suffix in suffixes and (changed is None or name in changed):
                 texts[name] = path.read_text()
-                for operator, own in list_places(name, texts[name], changed and changed[name]).items():
+                for operator, own in list_places(
+                    name, texts[name], changed and changed[name]
+                ).items():
                     places[operator] += own
         for number, (operator, place) in enumerate(draw_places(places, share, rng)):
             lines = make_lines(texts[place.path], place)

@@ -44,7 +44,11 @@ def mark(number: int) -> None:
 def insert_marks(text: str, number: int, is_kernel: bool) -> str:
     """Return the text of a file with a call of `mark` at the beginning of every function."""
     call = f"mark({number})" if is_kernel else f"__import__('fault_reach').mark({number})"
-    lines, out, depth, is_header, is_text = text.splitlines(), list[str](), 0, False, False
+    lines = text.splitlines()
+    out = list[str]()
+    depth = 0
+    is_header = False
+    is_text = False
     waits = -1  # Indentation of a function whose first statement is yet to come.
     for line in lines:
         code = re.sub(r'"[^"]*"|#.*', "", line)
@@ -63,7 +67,8 @@ def insert_marks(text: str, number: int, is_kernel: bool) -> str:
         depth += sum(map(code.count, "([{")) - sum(map(code.count, ")]}"))
         if depth == 0 and is_header and code.rstrip().endswith(":"):
             header = next(text for text in reversed(out) if HEADER.match(text))
-            waits, is_header = len(header) - len(header.lstrip()), False
+            waits = len(header) - len(header.lstrip())
+            is_header = False
     return "\n".join([*out, ""])
 
 

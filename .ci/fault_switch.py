@@ -31,12 +31,16 @@ DECLARED = re.compile(r"(cdef|cpdef|ctypedef|def|cimport|from|import)\b")
 CONTINUED = re.compile(r"(elif|else|except|finally)\b")
 
 
-def switch_change(lines: list[str], begin: int, end: int, new: list[str], number: int) -> list[str] | None:
+def switch_change(
+    lines: list[str], begin: int, end: int, new: list[str], number: int
+) -> list[str] | None:
     """Return the lines of a file in which [begin, end) and `new` are switched; None if they cannot be."""
     old = lines[begin:end]
     if len(old) == len(new):
         changes = [
-            (begin + i, begin + i + 1, [new[i]]) for i in range(len(new)) if new[i].strip() != old[i].strip()
+            (begin + i, begin + i + 1, [new[i]])
+            for i in range(len(new))
+            if new[i].strip() != old[i].strip()
         ]
     else:
         head = tail = 0
@@ -47,7 +51,9 @@ def switch_change(lines: list[str], begin: int, end: int, new: list[str], number
             tail += 1
         changes = [(begin + head, end - tail, new[head : len(new) - tail])]
     for first, last, replacement in reversed(changes):
-        switched = _switch_statements(lines, first, last, replacement, f"fault_number() == {number}")
+        switched = _switch_statements(
+            lines, first, last, replacement, f"fault_number() == {number}"
+        )
         if switched is None:
             return None
         lines = switched
@@ -57,7 +63,9 @@ def switch_change(lines: list[str], begin: int, end: int, new: list[str], number
 def insert_import(text: str, added: str = IMPORT) -> str:
     """Return the text of a kernel with an import, by default of `fault_number`, before its first import."""
     lines = text.splitlines()
-    first = next(k for k, line in enumerate(lines) if re.match(r"from [\w.]+ c?import |c?import ", line))
+    first = next(
+        k for k, line in enumerate(lines) if re.match(r"from [\w.]+ c?import |c?import ", line)
+    )
     return "\n".join([*lines[:first], added, *lines[first:], ""])
 
 
@@ -71,7 +79,8 @@ def _switch_statements(
         first -= 1
     while last < len(lines) and depth[last] > 0:
         last += 1
-    new, old = [*lines[first:begin], *new, *lines[end:last]], lines[first:last]
+    new = [*lines[first:begin], *new, *lines[end:last]]
+    old = lines[first:last]
     indent = _measure_indent((old or new)[0])
     pad = " " * indent
     if len(old) == len(new) == 1:
@@ -82,11 +91,17 @@ def _switch_statements(
             return [*lines[:first], header, *lines[last:]]
         a, b = DECLARED_VALUE.fullmatch(one), DECLARED_VALUE.fullmatch(other)
         if a and b and a[1] == b[1]:
-            return [*lines[:first], f"{pad}{a[1]}({b[2]}) if {condition} else ({a[2]})", *lines[last:]]
+            return [
+                *lines[:first],
+                f"{pad}{a[1]}({b[2]}) if {condition} else ({a[2]})",
+                *lines[last:],
+            ]
         a, b = RANGE.fullmatch(one), RANGE.fullmatch(other)
         if a and b:
             ends = zip(a[2].split(", "), b[2].split(", "), strict=False)
-            arguments = ", ".join(x if x == y else f"(({y}) if {condition} else ({x}))" for x, y in ends)
+            arguments = ", ".join(
+                x if x == y else f"(({y}) if {condition} else ({x}))" for x, y in ends
+            )
             return [*lines[:first], f"{pad}for {a[1]} in range({arguments}):", *lines[last:]]
     following = next((line for line in lines[last:] if line.strip()), "")
     for branch in (old, new):
@@ -99,12 +114,21 @@ def _switch_statements(
         ):
             return None
     branches = [["    " + line for line in branch] or [f"{pad}    pass"] for branch in (new, old)]
-    return [*lines[:first], f"{pad}if {condition}:", *branches[0], f"{pad}else:", *branches[1], *lines[last:]]
+    return [
+        *lines[:first],
+        f"{pad}if {condition}:",
+        *branches[0],
+        f"{pad}else:",
+        *branches[1],
+        *lines[last:],
+    ]
 
 
 def _count_open_brackets(lines: list[str]) -> list[int]:
     """Return the number of brackets that are open before each line, and after the last."""
-    depth, is_text, counts = 0, False, [0]
+    depth = 0
+    is_text = False
+    counts = [0]
     for line in lines:
         is_delimiter = line.count('"""') % 2 == 1
         if not is_text and not is_delimiter:

@@ -22,7 +22,8 @@ def least(*calls: Callable[[], Any], seconds: float = 0.2) -> list[float]:
         call()
         counts.append(max(1, min(10_000, int(1e-3 / max(perf_counter() - start, 1e-8)))))
     best = [float("inf")] * len(calls)
-    begun, rounds = perf_counter(), 0
+    begun = perf_counter()
+    rounds = 0
     collects = gc.isenabled()
     gc.disable()
     try:

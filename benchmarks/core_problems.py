@@ -29,10 +29,15 @@ def stacks(
     v = np.zeros((n, 6))
     v[:, 2] = -9.81 / 60.0
     rows = lv.Rows(
-        inv_mass, 6.0 * inv_mass[:, None, None] * np.eye(3), v,
-        normal=np.tile([0.0, 0.0, 1.0], (corners * n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (corners * n, 1)),
-        arm_a=arm, arm_b=arm * [1.0, 1.0, -1.0], contact_body=np.column_stack([below, above]).astype(np.int32),
-    )  # fmt: skip
+        inv_mass,
+        6.0 * inv_mass[:, None, None] * np.eye(3),
+        v,
+        normal=np.tile([0.0, 0.0, 1.0], (corners * n, 1)),
+        tangent=np.tile([1.0, 0.0, 0.0], (corners * n, 1)),
+        arm_a=arm,
+        arm_b=arm * [1.0, 1.0, -1.0],
+        contact_body=np.column_stack([below, above]).astype(np.int32),
+    )
     return Problem.from_rows(rows, mu=0.0 if mu is None else mu)
 
 
@@ -63,7 +68,12 @@ def fresh(problem: Problem) -> Problem:
     """Return a copy without derived data."""
     more = {"compliance": problem.compliance, "friction": problem.friction, "copy": False}
     return Problem(
-        problem.b, problem.cones, problem.matrix, rows=problem.rows, generalized=problem.generalized, **more
+        problem.b,
+        problem.cones,
+        problem.matrix,
+        rows=problem.rows,
+        generalized=problem.generalized,
+        **more,
     )
 
 
@@ -105,7 +115,8 @@ def lattice_pile(contacts: int, *, shuffle: bool = False, seed: int = 0) -> Prob
     body, along = body[order], along[order]
     if shuffle:
         body = np.append(rng.permutation(k**3), -1).astype(np.int32)[body]
-    c, n = len(body), k**3
+    c = len(body)
+    n = k**3
     normal = 0.4 * (rng.random((c, 3)) - 0.5)
     normal[np.arange(c), along] += 1.0
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -116,7 +127,14 @@ def lattice_pile(contacts: int, *, shuffle: bool = False, seed: int = 0) -> Prob
     v_free = np.zeros((n, 6))
     v_free[:, :3] = rng.normal(scale=0.1, size=(n, 3)) - [0.0, 0.0, 0.1]
     rows = Rows(
-        np.ones(n), inertia, v_free, normal=normal, tangent=tangent,
-        arm_a=np.where(body[:, :1] >= 0, 0.5 * normal, 0.0), arm_b=-0.5 * normal, contact_body=body, copy=False,
-    )  # fmt: skip
+        np.ones(n),
+        inertia,
+        v_free,
+        normal=normal,
+        tangent=tangent,
+        arm_a=np.where(body[:, :1] >= 0, 0.5 * normal, 0.0),
+        arm_b=-0.5 * normal,
+        contact_body=body,
+        copy=False,
+    )
     return Problem.from_rows(rows, mu=0.5, tangents=2, name=f"lattice pile of {c} contacts")

@@ -58,7 +58,9 @@ def read_program(path: str | Path) -> dict[str, Any]:
     import scipy.sparse as sp
 
     with np.load(path) as data:
-        arrays = {key: data[key] for key in ("q", "b", "h", "lb", "ub", "P", "A", "G") if key in data}
+        arrays = {
+            key: data[key] for key in ("q", "b", "h", "lb", "ub", "P", "A", "G") if key in data
+        }
         for key in "PAG":
             if f"{key}_data" in data:
                 parts = (data[f"{key}_{part}"] for part in ("data", "indices", "indptr"))
@@ -81,7 +83,8 @@ def is_right(arrays: dict[str, Any], optimum: float, x: Any) -> bool:
             if np.any((np.abs(gap) if is_equation else gap) > RIGHT * np.maximum(size, 1e-3)):
                 return False
     size = np.maximum(np.abs(x).max(initial=0.0), 1.0)
-    low, high = arrays.get("lb", -np.inf), arrays.get("ub", np.inf)
+    low = arrays.get("lb", -np.inf)
+    high = arrays.get("ub", np.inf)
     return bool(np.all((x >= low - RIGHT * size) & (x <= high + RIGHT * size)))
 
 
@@ -113,7 +116,11 @@ def solve_program_alone(path: str, optimum: float, solver: str) -> Answer:
         given = {k: v.toarray() if sp.issparse(v) else v for k, v in given.items()}
     begun = process_time()
     x = qpsolvers.solve_qp(**given, solver=solver, **ALONE.get(solver, {}))
-    return {"right": is_right(arrays, optimum, x), "found": x is not None, "seconds": process_time() - begun}
+    return {
+        "right": is_right(arrays, optimum, x),
+        "found": x is not None,
+        "seconds": process_time() - begun,
+    }
 
 
 def solve_problem(path: str, solver: str, out: str) -> Answer:
@@ -138,13 +145,16 @@ def step_models(tests: str) -> Answer:
 
     import lavender as lv
 
-    count, mj = Counter[str](), published.mj
+    count = Counter[str]()
+    mj = published.mj
     for (_, model), _ in zip(published.iterate_models(), range(N_MODELS), strict=False):
         count["models"] += 1
         model.opt.enableflags &= ~int(mj.mjtEnableBit.mjENBL_SLEEP)
         model.opt.noslip_iterations = 0
         for name in published.INTEGRATORS:
-            model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{name}", mj.mjtIntegrator.mjINT_EULER)
+            model.opt.integrator = getattr(
+                mj.mjtIntegrator, f"mjINT_{name}", mj.mjtIntegrator.mjINT_EULER
+            )
             try:
                 states, after = published.step_model(model, count["models"])
                 velocity = np.full(after.shape, np.nan)
@@ -183,12 +193,18 @@ class Checkout:
     """A process in a built checkout."""
 
     def __init__(self, folder: Path) -> None:
-        code = f"import runpy; runpy.run_path({str(Path(__file__).resolve())!r}, run_name='__main__')"
+        code = (
+            f"import runpy; runpy.run_path({str(Path(__file__).resolve())!r}, run_name='__main__')"
+        )
         environment = os.environ | {"PYTHONPATH": str(folder)}
         self.process = subprocess.Popen(
-            [sys.executable, "-c", code], cwd=folder, env=environment, text=True, stdin=subprocess.PIPE,
+            [sys.executable, "-c", code],
+            cwd=folder,
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-        )  # fmt: skip
+        )
         self.folder = folder
 
     def ask(self, *call: Any) -> Answer:
@@ -219,11 +235,17 @@ def build_base(commit: str) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work) / "base"
-        subprocess.run(["git", "worktree", "add", "-q", "--detach", folder, commit], cwd=ROOT, check=True)
+        subprocess.run(
+            ["git", "worktree", "add", "-q", "--detach", folder, commit], cwd=ROOT, check=True
+        )
         try:
             command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
             subprocess.run(
-                command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                command,
+                cwd=folder,
+                check=True,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
             )
             yield folder
         finally:
@@ -273,7 +295,9 @@ def compare_problems(
                 answers = ask_both(sides, "solve_problem", str(path), solver, out=out)
                 for answer, impulse in zip(answers, out, strict=True):
                     if Path(impulse).exists():
-                        answer["relative"] = float(lv.residual(lv.load(path), np.load(impulse)).relative)
+                        answer["relative"] = float(
+                            lv.residual(lv.load(path), np.load(impulse)).relative
+                        )
                         Path(impulse).unlink()
                 yield {
                     "group": group,
@@ -289,7 +313,11 @@ def list_problems(folder: Path) -> list[tuple[str, Path]]:
     files = sorted(path for suffix in ("npz", "hdf5") for path in folder.rglob(f"*.{suffix}"))
     return [
         (
-            "FCLIB" if path.suffix == ".hdf5" else "reference" if path.parent == folder else path.parent.name,
+            "FCLIB"
+            if path.suffix == ".hdf5"
+            else "reference"
+            if path.parent == folder
+            else path.parent.name,
             path,
         )
         for path in files
@@ -313,10 +341,23 @@ def write_drawn_problems(count: int, folder: Path) -> list[tuple[str, Path]]:
 def run_reports(folder: Path) -> str:
     """Run the table of public reports of this checkout with the package of a checkout; return the last line."""
     table = str(ROOT / "tests/field/test_reports.py")
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", table]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "--tb=no",
+        table,
+    ]
     command += ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT)]
     environment = os.environ | {"PYTHONPATH": str(folder)}
-    ended = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
+    ended = subprocess.run(
+        command, cwd=folder, env=environment, text=True, capture_output=True, check=False
+    )
     return ended.stdout.strip().rpartition("\n")[2]
 
 
@@ -329,7 +370,8 @@ def is_solved(answer: Answer) -> bool:
 
 def summarize(rows: list[Answer]) -> list[list[str]]:
     """Return a table's lines: by group and solver, solved by either commit, lost, work, and ratios of times."""
-    lines, keys = [], list(dict.fromkeys((row["group"], row["solver"]) for row in rows))
+    lines = []
+    keys = list(dict.fromkeys((row["group"], row["solver"]) for row in rows))
     for key in keys:
         own = [row for row in rows if (row["group"], row["solver"]) == key]
         alone = [row["alone"] for row in own if row.get("alone")]
@@ -337,19 +379,29 @@ def summarize(rows: list[Answer]) -> list[list[str]]:
         both = [row for row, *is_both in zip(own, *solved, strict=True) if all(is_both)]
         ratios = sorted(row["head"]["seconds"] / max(row["base"]["seconds"], 1e-9) for row in both)
         work = [
-            [sum(row[side].get("work", {}).get(kind, 0) for row in both) for side in ("base", "head")]
+            [
+                sum(row[side].get("work", {}).get(kind, 0) for row in both)
+                for side in ("base", "head")
+            ]
             for kind in ("factorisations", "sweeps")
         ]
         wrong = [
-            sum(bool(row[x].get("found") and not row[x]["right"]) for row in own) for x in ("base", "head")
+            sum(bool(row[x].get("found") and not row[x]["right"]) for row in own)
+            for x in ("base", "head")
         ]
-        lines.append([
-            *key, str(len(own)), str(sum(a.get("right", False) for a in alone)) if alone else "",
-            f"{sum(solved[0])} -> {sum(solved[1])}", f"{wrong[0]} -> {wrong[1]}",
-            str(sum(row["base"]["status"] != row["head"]["status"] for row in own)),
-            *(f"{x} -> {y}" if x or y else "" for x, y in work),
-            f"{np.median(ratios):.2f}" if ratios else "", f"{ratios[-1]:.2f}" if ratios else "",
-        ])  # fmt: skip
+        lines.append(
+            [
+                *key,
+                str(len(own)),
+                str(sum(a.get("right", False) for a in alone)) if alone else "",
+                f"{sum(solved[0])} -> {sum(solved[1])}",
+                f"{wrong[0]} -> {wrong[1]}",
+                str(sum(row["base"]["status"] != row["head"]["status"] for row in own)),
+                *(f"{x} -> {y}" if x or y else "" for x, y in work),
+                f"{np.median(ratios):.2f}" if ratios else "",
+                f"{ratios[-1]:.2f}" if ratios else "",
+            ]
+        )
     return lines
 
 
@@ -358,8 +410,10 @@ def list_changes(rows: list[Answer]) -> Iterator[str]:
     for row in rows:
         base, head = is_solved(row["base"]), is_solved(row["head"])
         if base != head:
-            own = [f"{a['status']}, {a['relative']:.1e}" if "relative" in a else a["status"]
-                   for a in (row["base"], row["head"])]  # fmt: skip
+            own = [
+                f"{a['status']}, {a['relative']:.1e}" if "relative" in a else a["status"]
+                for a in (row["base"], row["head"])
+            ]
             yield f"{'lost' if base else 'gained'}: {row['name']} by {row['solver']}: {own[0]} -> {own[1]}"
 
 
@@ -372,7 +426,9 @@ def list_models(sides: list[Checkout]) -> Iterator[str]:
         return
     for name, side in zip(("base", "head"), sides, strict=True):
         count = side.ask("step_models", str(ROOT / "tests"))
-        yield f"robot models, {name}: " + ", ".join(f"{key} {value}" for key, value in count.items())
+        yield f"robot models, {name}: " + ", ".join(
+            f"{key} {value}" for key, value in count.items()
+        )
 
 
 def make_command() -> Any:
@@ -390,9 +446,16 @@ def make_command() -> Any:
         help="Folder of recorded problems.",
     )
     @click.option(
-        "--solver", "solvers", multiple=True, default=("auto",), show_default=True, help="Of problems."
+        "--solver",
+        "solvers",
+        multiple=True,
+        default=("auto",),
+        show_default=True,
+        help="Of problems.",
     )
-    @click.option("--drawn", default=20, show_default=True, help="Number of seeds of drawn problems.")
+    @click.option(
+        "--drawn", default=20, show_default=True, help="Number of seeds of drawn problems."
+    )
     @out_option("Write every answer to this JSON file.")
     def command(
         base: str, problems: Path | None, solvers: tuple[str, ...], drawn: int, out: Path | None
@@ -404,19 +467,40 @@ def make_command() -> Any:
         backends = [name for name in BACKENDS if name in installed]
         if missing := [name for name in BACKENDS if name not in installed]:
             click.echo(f"not installed: {', '.join(missing)}")
-        beside = problems.resolve().parent / "programs" if problems else ROOT / "tests/field/programs"
+        beside = (
+            problems.resolve().parent / "programs" if problems else ROOT / "tests/field/programs"
+        )
         programs = beside if beside.is_dir() else ROOT / "tests/field/programs"
         if problems is None:
             click.echo("recorded problems and FCLIB: LAVENDER_PROBLEMS does not name a folder")
         reports = ROOT / "tests/field/test_reports.py"
         with build_base(base) as folder, tempfile.TemporaryDirectory() as work:
             sides = [Checkout(folder), Checkout(ROOT)]
-            files = [*(list_problems(problems) if problems else []), *write_drawn_problems(drawn, Path(work))]
-            rows = [*compare_programs(sides, programs, backends), *compare_problems(sides, files, solvers)]
-            head = ["inputs", "solver", "number", "right alone", "solved", "wrong and found", "other status",
-                    "factorisations", "sweeps", "CPU time: median ratio", "largest"]  # fmt: skip
+            files = [
+                *(list_problems(problems) if problems else []),
+                *write_drawn_problems(drawn, Path(work)),
+            ]
+            rows = [
+                *compare_programs(sides, programs, backends),
+                *compare_problems(sides, files, solvers),
+            ]
+            head = [
+                "inputs",
+                "solver",
+                "number",
+                "right alone",
+                "solved",
+                "wrong and found",
+                "other status",
+                "factorisations",
+                "sweeps",
+                "CPU time: median ratio",
+                "largest",
+            ]
             click.echo(markdown(head, summarize(rows)))
-            click.echo("\n".join(list_changes(rows)) or "no input is solved by one of the commits only")
+            click.echo(
+                "\n".join(list_changes(rows)) or "no input is solved by one of the commits only"
+            )
             if reports.exists():
                 click.echo(f"reports: {run_reports(folder)} -> {run_reports(ROOT)}")
             else:

@@ -62,9 +62,13 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         "islands of 36 rows": lambda: forms(stacks(6, 3, 0.4, False))["bodies"],
         "islands of 180 rows": lambda: forms(stacks(4, 15, 0.4, False))["bodies"],
         "islands of 120 rows": lambda: forms(stacks(4, 10, 0.4, False))["bodies"],
-        "band": lambda: Problem.lcp(lv.suite.stack(n=300).problem.csr, lv.suite.stack(n=300).problem.b),
+        "band": lambda: Problem.lcp(
+            lv.suite.stack(n=300).problem.csr, lv.suite.stack(n=300).problem.b
+        ),
         "stack": lambda: lv.suite.case("box_stackF(n=12, mass_ratio=50)").problem,
-        "soft velocities": lambda: random_generalized_problem(1, "cone", n=150, compliance=True, contacts=60),
+        "soft velocities": lambda: random_generalized_problem(
+            1, "cone", n=150, compliance=True, contacts=60
+        ),
         "many soft velocities": lambda: over_velocities(90, 150, compliance=300.0),
         "loose pile": lambda: pile(5),
         "velocities of a pile": lambda: general(pile(4)),
@@ -75,14 +79,17 @@ def count_work(name: str, factor: float) -> dict[str, float]:
         "slow": lambda: wild(24, rows=600).problem,
         "no solution": lambda: without_solution(1, 90),
         "infeasible": lambda: lv.suite.case("painleve()").problem,
-    }  # fmt: skip
+    }
     counted = {}
     for label, make in problems.items():
         problem = make().disk
         get_zero_impulse_reference(problem)
         solution = lv.solve(problem)
-        tree, work = DecisionTree(problem), solution.work
-        factorisation = tree.newton_state.cost / tree.newton_state.steps if tree.newton_state else 0.0
+        tree = DecisionTree(problem)
+        work = solution.work
+        factorisation = (
+            tree.newton_state.cost / tree.newton_state.steps if tree.newton_state else 0.0
+        )
         sweeps = work.get("sweeps", 0) + 2 * work.get("solves", 0)
         counted[label] = sweeps * tree.sweep + work.get("factorisations", 0) * factorisation
         limited = DecisionTree(problem, Deadline(1e9))
@@ -93,9 +100,11 @@ def count_work(name: str, factor: float) -> dict[str, float]:
             share = ((call and call.get_remaining_seconds()) or 0.0) / limit
             counted[f"{label}, {limit:g} s"] = 1.0 + fits + round(2.0 * share, 1)
         counted[f"{label}, stages"] = math.fsum(
-            min(stage.iterations, 1e9) * (1 + i) for i, stage in enumerate(lv.explain(problem).stages)
+            min(stage.iterations, 1e9) * (1 + i)
+            for i, stage in enumerate(lv.explain(problem).stages)
         )
-        halving, total = SimpleNamespace(best=1.0), 0.0
+        halving = SimpleNamespace(best=1.0)
+        total = 0.0
         for stage in DecisionTree(problem, log=halving):
             halving.best *= 0.5
             total += min(stage.cost, 1e12)
@@ -107,14 +116,18 @@ def run_changed(name: str, factor: float) -> dict[str, float]:
     """Return `count_work` of a new process."""
     code = "import json; from benchmarks.decisions import count_work; "
     code += f"print(json.dumps(count_work({name!r}, {factor})))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     counted: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return counted
 
 
 def compare_work(before: dict[str, float], after: dict[str, float]) -> tuple[float, int]:
     """Return the geometric mean ratio of the work of the solves, and the number of changed items."""
-    solved = [label for label in before if "," not in label and before[label] > 0.0 and after[label] > 0.0]
+    solved = [
+        label for label in before if "," not in label and before[label] > 0.0 and after[label] > 0.0
+    ]
     ratios = [math.log(after[label] / before[label]) for label in solved]
     changed = sum(before[label] != after[label] for label in before)
     return math.exp(math.fsum(ratios) / len(ratios)), changed
@@ -134,5 +147,11 @@ def command() -> None:
             ratio, changed = compare_work(base, run_changed(number.name, factor))
             cells.append(f"{ratio:.3f} ({changed})")
         lines.append(cells)
-    head = ["number", "value", "unit", "halved: work (changed items)", "doubled: work (changed items)"]
+    head = [
+        "number",
+        "value",
+        "unit",
+        "halved: work (changed items)",
+        "doubled: work (changed items)",
+    ]
     click.echo(markdown(head, lines))

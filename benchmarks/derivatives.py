@@ -59,8 +59,12 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
         for cone in (mj.mjtCone.mjCONE_PYRAMIDAL, mj.mjtCone.mjCONE_ELLIPTIC):
             model = mj.MjModel.from_xml_path(path)
             model.opt.cone = cone
-            data, rng, count = mj.MjData(model), np.random.default_rng(1), 0
-            low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+            data = mj.MjData(model)
+            rng = np.random.default_rng(1)
+            count = 0
+            low, high = np.where(
+                model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]
+            ).T
             for step in range(20 * steps):
                 if step % 20 == 0:
                     data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
@@ -101,7 +105,8 @@ def along(problem: lv.Problem, h: float, change: np.ndarray) -> lv.Problem:
 
 def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None:
     """Compare the derivative with differences; return None if the problem is not solved."""
-    rng, solution = np.random.default_rng(seed), solved(problem)
+    rng = np.random.default_rng(seed)
+    solution = solved(problem)
     if solution is None:
         return None
     d = lv.derivative(problem, solution)
@@ -110,7 +115,9 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
         change = -(problem.jacobian @ rng.standard_normal(n))  # change of b due to v*
     else:
         change = rng.standard_normal(problem.m)
-    size = float(np.abs(problem.b).max(initial=1e-3)) / max(float(np.abs(change).max(initial=0.0)), 1e-300)
+    size = float(np.abs(problem.b).max(initial=1e-3)) / max(
+        float(np.abs(change).max(initial=0.0)), 1e-300
+    )
     change = change * size
     try:
         found = d.jvp(b=change).slack
@@ -130,7 +137,9 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
 
     # Start from zero: a start at the floor would be returned unchanged. If there are several motions, use the nearest.
     start = solution.impulse if problem.law == "coulomb" else None
-    best, error, before = None, np.inf, None
+    best = None
+    error = np.inf
+    before = None
     for h in DIFFERENCE_STEPS:
         low, high = (solved(along(problem, x, change), start) for x in (-h, h))
         if low is None or high is None:
@@ -140,16 +149,22 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
         now = (high.slack - low.slack) / (2.0 * h)
         # Error of w from the residuals, or from rounding: sqrt(J), as in `norm`.
         left = sum(
-            max(x.residual.energy, x.residual.roundoff_floor * x.residual.energy_at_zero) for x in (low, high)
+            max(x.residual.energy, x.residual.roundoff_floor * x.residual.energy_at_zero)
+            for x in (low, high)
         )
         if before is not None and max(norm(now - before), left / (2.0 * h)) < error:
-            best, error = now, max(norm(now - before), left / (2.0 * h))
+            best = now
+            error = max(norm(now - before), left / (2.0 * h))
         before = now
     if best is None:
-        return Compared(source, problem.law, problem.operator, problem.m, " and ".join(told), np.nan, np.nan)
+        return Compared(
+            source, problem.law, problem.operator, problem.m, " and ".join(told), np.nan, np.nan
+        )
     scale = max(norm(best), norm(change) * 1e-3, 1e-300)
     off = norm(found - best) / scale
-    return Compared(source, problem.law, problem.operator, problem.m, " and ".join(told), off, error / scale)
+    return Compared(
+        source, problem.law, problem.operator, problem.m, " and ".join(told), off, error / scale
+    )
 
 
 def agrees(line: Compared) -> bool:
@@ -165,7 +180,8 @@ def agreement(lines: list[Compared]) -> str:
         of = [x for x in lines if key in (None, (x.law, x.operator))]
         refused = sum(x.flagged == REFUSED for x in of)
         seen = [x for x in of if not np.isnan(x.off)]
-        free, wrong = [x for x in seen if not x.flagged], [x for x in seen if not agrees(x)]
+        free = [x for x in seen if not x.flagged]
+        wrong = [x for x in seen if not agrees(x)]
         rows.append(
             (
                 *(key or ("all", "")),
@@ -280,10 +296,17 @@ def costs(lines: list[Cost]) -> str:
                     np.array([getattr(x, name) / x.solve for x in of]) for name in ("first", "more")
                 )
                 rows.append(
-                    (source, f"{low} to {high - 1}" if high < 10**9 else f"{low} and more", len(of),
-                     f"{1e6 * np.median([x.solve for x in of]):.0f}", f"{np.median(first):.2f}",
-                     f"{np.mean(first <= 1.0):.0%}", f"{np.median(more):.2f}", f"{np.mean(more <= 0.2):.0%}")
-                )  # fmt: skip
+                    (
+                        source,
+                        f"{low} to {high - 1}" if high < 10**9 else f"{low} and more",
+                        len(of),
+                        f"{1e6 * np.median([x.solve for x in of]):.0f}",
+                        f"{np.median(first):.2f}",
+                        f"{np.mean(first <= 1.0):.0%}",
+                        f"{np.median(more):.2f}",
+                        f"{np.mean(more <= 0.2):.0%}",
+                    )
+                )
     head = (
         "source",
         "rows",
@@ -304,8 +327,11 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
     from lavender.io import from_mujoco
 
     model = mj.MjModel.from_xml_path(path)
-    data, rng = mj.MjData(model), np.random.default_rng(1)
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    data = mj.MjData(model)
+    rng = np.random.default_rng(1)
+    low, high = np.where(
+        model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]
+    ).T
     for _ in range(steps):
         data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
         mj.mj_step(model, data)
@@ -324,7 +350,8 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
             mj.mj_forward(model, other)
             ends.append(other.qfrc_actuator.copy())
         free[:, i] = model.opt.timestep * g.solve((ends[1] - ends[0]) / 2e-3)
-    unit, found = np.eye(g.nv), None
+    unit = np.eye(g.nv)
+    found = None
 
     def implicit() -> np.ndarray:
         d = lv.derivative(problem, solution)
@@ -369,8 +396,12 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
 
 @click.command("derivatives")
 @click.option("--draws", default=300, show_default=True, help="Problems of `wild`.")
-@click.option("--steps", default=125, show_default=True, help="Steps of each model, under each of its cones.")
-@click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
+@click.option(
+    "--steps", default=125, show_default=True, help="Steps of each model, under each of its cones."
+)
+@click.option(
+    "--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model."
+)
 @click.option("--only", type=click.Choice(("agreement", "costs")), help="One part alone.")
 def command(draws: int, steps: int, models: tuple[str, ...], only: str | None) -> None:
     """Compare derivatives with differences of solves: agreement, flags, times."""
@@ -383,7 +414,9 @@ def command(draws: int, steps: int, models: tuple[str, ...], only: str | None) -
         measured = [x for source, p in given if (x := cost(source, p)) is not None]
         for path in models:
             for i, made in enumerate(_chunks(list(robots((path,), 64)), 64)):
-                measured.append(batch(f"64 of {Path(path).stem}, {('pyramids', 'cones')[i % 2]}", made))
+                measured.append(
+                    batch(f"64 of {Path(path).stem}, {('pyramids', 'cones')[i % 2]}", made)
+                )
         click.echo("\n" + costs(measured))
         lines += measured
         if models:

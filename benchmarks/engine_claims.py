@@ -48,15 +48,20 @@ def build_boxes(masses: list[float], restitution: float = 0.0, pile: bool = Fals
     for k, mass in enumerate(masses):
         moment = mass * (2.0 * HALF_EDGE) ** 2 / 6.0
         turn, shift, gap = (
-            (rng.normal(size=4), rng.uniform(-0.08, 0.08, 2), 0.4) if pile else ([0, 0, 0, 1], [0, 0], 0.2)
+            (rng.normal(size=4), rng.uniform(-0.08, 0.08, 2), 0.4)
+            if pile
+            else ([0, 0, 0, 1], [0, 0], 0.2)
         )
         turn = np.asarray(turn, float) / np.linalg.norm(turn)
         bounce_height = 0.1 if restitution else 0.0
         height = (0.25 if pile else HALF_EDGE) + gap * k + bounce_height
         body = builder.add_body(
-            xform=wp.transformf(*map(float, (*shift, height, *turn))), mass=mass,
-            inertia=wp.mat33f(np.diag([moment] * 3)), lock_inertia=True, label=f"box_{k}",
-        )  # fmt: skip
+            xform=wp.transformf(*map(float, (*shift, height, *turn))),
+            mass=mass,
+            inertia=wp.mat33f(np.diag([moment] * 3)),
+            lock_inertia=True,
+            label=f"box_{k}",
+        )
         builder.add_shape_box(body, hx=HALF_EDGE, hy=HALF_EDGE, hz=HALF_EDGE, cfg=shape)
     builder.add_ground_plane(cfg=shape)
     return builder
@@ -109,7 +114,11 @@ class Checks:
         """Count whether two errors [m/s] lead to the same verdict."""
         self.total += 1
         low, high = sorted((own, judged))
-        if high <= self.threshold or low > self.threshold or high <= WEIGHT_RATIO * max(low, self.threshold):
+        if (
+            high <= self.threshold
+            or low > self.threshold
+            or high <= WEIGHT_RATIO * max(low, self.threshold)
+        ):
             self.agree += 1
         else:
             self.disagreements.append((world, own, judged))
@@ -121,19 +130,37 @@ def read_engine(solver: Any) -> Callable[[int], tuple[Any, ...]]:
     data, info = engine.problem_fd.data, engine.solver_fd.data
     arrays = {
         name: getattr(data, name).numpy()
-        for name in ("dim", "mio", "vio", "P", "D", "v_f", "njc", "nbc", "nl", "nc", "bcio", "cio", "mu",
-                     "bound_lower", "bound_upper")
+        for name in (
+            "dim",
+            "mio",
+            "vio",
+            "P",
+            "D",
+            "v_f",
+            "njc",
+            "nbc",
+            "nl",
+            "nc",
+            "bcio",
+            "cio",
+            "mu",
+            "bound_lower",
+            "bound_upper",
+        )
         if getattr(data, name) is not None
-    }  # fmt: skip
+    }
     lambdas, sigma = info.solution.lambdas.numpy(), info.state.sigma.numpy()
 
     def read_world(i: int) -> tuple[Any, ...]:
         size, start, first = (int(arrays[name][i]) for name in ("dim", "mio", "vio"))
-        joints, bounded, limits, contacts = (int(arrays[name][i]) for name in ("njc", "nbc", "nl", "nc"))
+        joints, bounded, limits, contacts = (
+            int(arrays[name][i]) for name in ("njc", "nbc", "nl", "nc")
+        )
         scale = arrays["P"][first : first + size].astype(float)
         matrix = arrays["D"][start : start + size**2].reshape(size, size).astype(float)
         matrix = (matrix - float(sigma[i][0]) * np.eye(size)) / np.outer(scale, scale)
-        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        lower = np.full(size, -np.inf)
+        upper = np.full(size, np.inf)
         rows = slice(joints, joints + bounded)
         at = slice(int(arrays["bcio"][i]), int(arrays["bcio"][i]) + bounded)
         lower[rows], upper[rows] = (
@@ -143,7 +170,8 @@ def read_engine(solver: Any) -> Callable[[int], tuple[Any, ...]]:
         before = joints + bounded + limits
         lower[joints + bounded : before] = 0.0
         mu = arrays["mu"][int(arrays["cio"][i]) :][:contacts].astype(float)
-        b, lam = -arrays["v_f"][first : first + size] / scale, lambdas[first : first + size].astype(float)
+        b = -arrays["v_f"][first : first + size] / scale
+        lam = lambdas[first : first + size].astype(float)
         return matrix, b, lam, before, lower, upper, mu
 
     return read_world
@@ -153,7 +181,8 @@ def measure_errors(
     matrix: Any, b: Any, lam: Any, before: int, lower: Any, upper: Any, mu: Any
 ) -> tuple[float, float, float]:
     """Return error [m/s], complementarity [J] and cone [N s] of a world, from the engine's arrays."""
-    w, d = matrix @ lam - b, np.diag(matrix).copy()
+    w = matrix @ lam - b
+    d = np.diag(matrix).copy()
     single = np.abs(d * (lam - np.clip(lam - w / d, lower, upper)))[:before]
     tangents = before + 3 * np.arange(len(mu))[:, None] + np.arange(2)
     normals = before + 3 * np.arange(len(mu)) + 2
@@ -189,15 +218,25 @@ def check_steps(running: NewtonScene, steps: int, checks: Checks) -> Iterator[En
             rows = step.batch.rows_of(i)
             if rows.stop == rows.start or not np.isfinite(judged[i]):
                 continue
-            problem, arrays = step.batch[i], world_of(i)
-            matrix, before, contacts = arrays[0], arrays[3], len(arrays[6])
-            order = [*range(before), *(before + 3 * k + j for k in range(contacts) for j in (2, 0, 1))]
-            difference = np.abs(problem.dense() - matrix[np.ix_(order, order)]).max() / np.abs(matrix).max()
+            problem = step.batch[i]
+            arrays = world_of(i)
+            matrix = arrays[0]
+            before = arrays[3]
+            contacts = len(arrays[6])
+            order = [
+                *range(before),
+                *(before + 3 * k + j for k in range(contacts) for j in (2, 0, 1)),
+            ]
+            difference = (
+                np.abs(problem.dense() - matrix[np.ix_(order, order)]).max() / np.abs(matrix).max()
+            )
             error, complementarity, cone = measure_errors(*arrays)
             checks.note("A", float(difference))
             checks.note("complementarity", complementarity)
             checks.note("cone", cone)
-            checks.note("momentum", float(np.abs(problem.velocity(step.impulse[rows]) - velocity[i]).max()))
+            checks.note(
+                "momentum", float(np.abs(problem.velocity(step.impulse[rows]) - velocity[i]).max())
+            )
             checks.compare(i, error, float(judged[i]))
 
 
@@ -208,7 +247,9 @@ def run_scene(
     running = start_scene(build, "kamino", worlds=worlds, spread=spread)
     assert isinstance(running, NewtonScene)
     checks = Checks(threshold)
-    return audit_steps(check_steps(running, steps, checks), engine="kamino", threshold=threshold), checks
+    return audit_steps(
+        check_steps(running, steps, checks), engine="kamino", threshold=threshold
+    ), checks
 
 
 @click.command()
@@ -216,7 +257,10 @@ def run_scene(
 @click.option("--worlds", default=8, show_default=True)
 @click.option("--steps", default=50, show_default=True)
 @click.option(
-    "--spread", default=0.01, show_default=True, help="Noise of the velocities at the start [m/s, rad/s]."
+    "--spread",
+    default=0.01,
+    show_default=True,
+    help="Noise of the velocities at the start [m/s, rad/s].",
 )
 @click.option(
     "--threshold",
@@ -226,7 +270,12 @@ def run_scene(
 )
 @out_option("Write the numbers to a JSON file.")
 def command(
-    names: tuple[str, ...], worlds: int, steps: int, spread: float, threshold: float, out: Path | None
+    names: tuple[str, ...],
+    worlds: int,
+    steps: int,
+    spread: float,
+    threshold: float,
+    out: Path | None,
 ) -> None:
     """Compare the claims of newton's SolverKamino with verdicts on 14 scenes, or on those named.
 
@@ -237,20 +286,50 @@ def command(
     disagreements = 0
     for name in names or SCENES:
         result, checks = run_scene(SCENES[name], worlds, steps, spread, threshold)
-        counts, disagreements = list(result.claim_counts.values()), disagreements + len(checks.disagreements)
+        counts = list(result.claim_counts.values())
+        disagreements = disagreements + len(checks.disagreements)
         worst = float(np.nanmax(result.numbers[0], initial=0.0))
-        numbers = [checks.largest.get(key, 0.0) for key in ("A", "complementarity", "cone", "momentum")]
-        rows.append([
-            name, str(result.verdict.size), *map(str, counts[:4]), str(sum(counts[4:])), format_size(worst),
-            f"{checks.agree} of {checks.total}", *map(format_size, numbers),
-        ])  # fmt: skip
-        lines.append({"scene": name, "counts": result.claim_counts, "worst": worst, "agree": checks.agree,
-                      "judged": checks.total, "disagreements": checks.disagreements, **checks.largest})  # fmt: skip
+        numbers = [
+            checks.largest.get(key, 0.0) for key in ("A", "complementarity", "cone", "momentum")
+        ]
+        rows.append(
+            [
+                name,
+                str(result.verdict.size),
+                *map(str, counts[:4]),
+                str(sum(counts[4:])),
+                format_size(worst),
+                f"{checks.agree} of {checks.total}",
+                *map(format_size, numbers),
+            ]
+        )
+        lines.append(
+            {
+                "scene": name,
+                "counts": result.claim_counts,
+                "worst": worst,
+                "agree": checks.agree,
+                "judged": checks.total,
+                "disagreements": checks.disagreements,
+                **checks.largest,
+            }
+        )
         click.echo(" | ".join(rows[-1]), err=True)
     heads = [
-        "scene", "answers", "claimed and right", "claimed and wrong", "right, not claimed", "wrong, not claimed",
-        "not finite", "worst [m/s]", "verdicts agree", "A [-]", "complementarity [J]", "cone [N s]", "momentum [m/s]",
-    ]  # fmt: skip
+        "scene",
+        "answers",
+        "claimed and right",
+        "claimed and wrong",
+        "right, not claimed",
+        "wrong, not claimed",
+        "not finite",
+        "worst [m/s]",
+        "verdicts agree",
+        "A [-]",
+        "complementarity [J]",
+        "cone [N s]",
+        "momentum [m/s]",
+    ]
     click.echo(markdown(heads, rows))
     if out is not None:
         write_json(out, lines, worlds=worlds, steps=steps, spread=spread, threshold=threshold)

@@ -51,7 +51,9 @@ def collect_problems(models: list[Path], files: list[Path]) -> Iterator[tuple[st
         yield "files", lv.load(path)
 
 
-def make_calls(problem: Problem, limit: float | None, solver: str) -> dict[str, Callable[[int], Timed]]:
+def make_calls(
+    problem: Problem, limit: float | None, solver: str
+) -> dict[str, Callable[[int], Timed]]:
     """Return, for each way of calling, a function that prepares so many solves as one function."""
 
     def prepare_cold(count: int) -> Timed:
@@ -62,7 +64,9 @@ def make_calls(problem: Problem, limit: float | None, solver: str) -> dict[str, 
     start = 0.9 * lv.solve(known, solver).impulse
 
     def prepare_warm(count: int) -> Timed:
-        return lambda: [lv.solve(known, solver, impulse=start, time_limit=limit) for _ in range(count)]
+        return lambda: [
+            lv.solve(known, solver, impulse=start, time_limit=limit) for _ in range(count)
+        ]
 
     prepared = lv.prepare(replace(problem, copy=False), solver)
 
@@ -73,16 +77,21 @@ def make_calls(problem: Problem, limit: float | None, solver: str) -> dict[str, 
     return {"cold": prepare_cold, "warm": prepare_warm, "prepared": prepare_prepared}
 
 
-def measure(problem: Problem, limit: float, solver: str, seconds: float) -> dict[str, tuple[float, float]]:
+def measure(
+    problem: Problem, limit: float, solver: str, seconds: float
+) -> dict[str, tuple[float, float]]:
     """Return for each way of calling the smallest CPU time of a call [s] without and with the limit."""
-    plain, limited = make_calls(problem, None, solver), make_calls(problem, limit, solver)
+    plain = make_calls(problem, None, solver)
+    limited = make_calls(problem, limit, solver)
     found = {}
     for kind in plain:
         pair = plain[kind], limited[kind]
         begun = perf_counter()
         pair[0](1)()
         count = max(1, min(MAX_BATCH, int(BATCH_TIME / (perf_counter() - begun))))
-        best, batches, begun = [np.inf, np.inf], 0, perf_counter()
+        best = [np.inf, np.inf]
+        batches = 0
+        begun = perf_counter()
         while batches < MIN_BATCHES or perf_counter() - begun < seconds:
             for i in (0, 1) if batches % 2 else (1, 0):
                 call = pair[i](count)
@@ -106,9 +115,13 @@ def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
     kinds = ("cold", "warm", "prepared")
     groups = [("all", lines)]
     for key in ("class", "form", "source"):
-        groups += [(name, [x for x in lines if x[key] == name]) for name in sorted({x[key] for x in lines})]
+        groups += [
+            (name, [x for x in lines if x[key] == name]) for name in sorted({x[key] for x in lines})
+        ]
     pairs = sorted({(x["class"], x["form"]) for x in lines})
-    groups += [(f"{c}, {f}", [x for x in lines if (x["class"], x["form"]) == (c, f)]) for c, f in pairs]
+    groups += [
+        (f"{c}, {f}", [x for x in lines if (x["class"], x["form"]) == (c, f)]) for c, f in pairs
+    ]
     rows = []
     for name, group in groups:
         cells = [name, str(len(group))]
@@ -120,30 +133,63 @@ def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
                 f"{max(ratios):.2f}",
             ]
         rows.append(cells)
-    head = ["problems", "count"] + [f"{kind}: {x}" for kind in kinds for x in ("mean", "median", "worst")]
+    head = ["problems", "count"] + [
+        f"{kind}: {x}" for kind in kinds for x in ("mean", "median", "worst")
+    ]
     click.echo(markdown(head, rows))
     flat = [(x[kind][1] / x[kind][0], kind, x) for x in lines for kind in kinds]
     flat.sort(key=lambda item: -item[0])
-    click.echo("\n" + markdown(
-        ["problem", "rows", "form", "law", "call", "ratio", "without [us]", "with [us]"],
-        [[x["name"], x["m"], x["form"], x["law"], kind, f"{ratio:.3f}", f"{1e6 * x[kind][0]:.1f}",
-          f"{1e6 * x[kind][1]:.1f}"] for ratio, kind, x in flat[:worst]]))  # fmt: skip
+    click.echo(
+        "\n"
+        + markdown(
+            ["problem", "rows", "form", "law", "call", "ratio", "without [us]", "with [us]"],
+            [
+                [
+                    x["name"],
+                    x["m"],
+                    x["form"],
+                    x["law"],
+                    kind,
+                    f"{ratio:.3f}",
+                    f"{1e6 * x[kind][0]:.1f}",
+                    f"{1e6 * x[kind][1]:.1f}",
+                ]
+                for ratio, kind, x in flat[:worst]
+            ],
+        )
+    )
 
 
 @click.command("limit_overhead")
-@click.option("--models", multiple=True, type=click.Path(path_type=Path, exists=True),
-              help="Folder with XML files of MuJoCo.")  # fmt: skip
-@click.option("--file", "files", multiple=True, type=click.Path(path_type=Path, exists=True),
-              help="Problem in a file.")  # fmt: skip
+@click.option(
+    "--models",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Folder with XML files of MuJoCo.",
+)
+@click.option(
+    "--file",
+    "files",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Problem in a file.",
+)
 @click.option("--solver", default="auto", show_default=True)
 @click.option("--limit", default=10.0, show_default=True, help="Time limit [s].")
-@click.option("--seconds", default=0.3, show_default=True, help="Wall time [s] of each measurement.")
+@click.option(
+    "--seconds", default=0.3, show_default=True, help="Wall time [s] of each measurement."
+)
 @click.option("--worst", default=12, show_default=True, help="Number of calls that are listed.")
 @out_option("Write every measurement to this JSON file.")
 def command(
-    models: tuple[Path, ...], files: tuple[Path, ...], solver: str, limit: float, seconds: float, worst: int,
+    models: tuple[Path, ...],
+    files: tuple[Path, ...],
+    solver: str,
+    limit: float,
+    seconds: float,
+    worst: int,
     out: Path | None,
-) -> None:  # fmt: skip
+) -> None:
     """Measure the overhead of a time limit that does not bind."""
     paths = sorted(path for folder in models for path in folder.rglob("*.xml"))
     lines = []
@@ -152,10 +198,17 @@ def command(
         if not 0 < problem.m <= MAX_ROWS:
             continue
         form = {"rows": "bodies", "matrix": "matrix", "generalized": "J and M"}[problem.operator]
-        lines.append({
-            "source": source, "name": problem.name, "m": problem.m, "law": problem.law, "form": form,
-            "class": name_class(problem), **measure(problem, limit, solver, seconds),
-        })  # fmt: skip
+        lines.append(
+            {
+                "source": source,
+                "name": problem.name,
+                "m": problem.m,
+                "law": problem.law,
+                "form": form,
+                "class": name_class(problem),
+                **measure(problem, limit, solver, seconds),
+            }
+        )
         gc.collect()
     print_tables(lines, worst)
     if out is not None:

@@ -38,8 +38,18 @@ from lavender.problem import Problem
 from lavender.solvers.registry import get
 from lavender_ext.core.deadline import play_clock
 
-CASES = ("stack(n=64)", "chain(n=33)", "pyramidF(k=6)", "stack(n=5000)", "granular(n=12)", "granularF(n=12)",
-         "dense 300 x 100", "dense 3000 x 300", "matrix 300", "matrix 2400")  # fmt: skip
+CASES = (
+    "stack(n=64)",
+    "chain(n=33)",
+    "pyramidF(k=6)",
+    "stack(n=5000)",
+    "granular(n=12)",
+    "granularF(n=12)",
+    "dense 300 x 100",
+    "dense 3000 x 300",
+    "matrix 300",
+    "matrix 2400",
+)
 LIMITS = (1e-3, 1e-2)  # s
 OVERHEAD = 5e-3  # s
 SHEET_SWEEPS = (
@@ -49,7 +59,14 @@ SHEET_SWEEPS = (
     "nncg",
     "anderson",
 )  # Four accept each problem.
-KINDS = {"structure": 0.45, "columns": 0.2, "lattice": 0.1, "granular": 0.1, "chain": 0.1, "dense": 0.05}
+KINDS = {
+    "structure": 0.45,
+    "columns": 0.2,
+    "lattice": 0.1,
+    "granular": 0.1,
+    "chain": 0.1,
+    "dense": 0.05,
+}
 FORM_NAMES = ("bodies", "matrix", "J and M")
 TOLERANCE, REPEATS = 1e-6, 3
 
@@ -74,17 +91,24 @@ def problem_of(name: str) -> Callable[[], Problem]:
     m = int(rest.split(" x ")[0])
     if kind == "dense":
         n = int(rest.split(" x ")[1])
-        half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=n)
+        half = rng.normal(size=(n, n))
+        jac = rng.normal(size=(m, n))
+        free = rng.normal(size=n)
         cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
         return lambda: Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
-    half, b = rng.normal(size=(m, m // 2)), rng.normal(size=m)
+    half = rng.normal(size=(m, m // 2))
+    b = rng.normal(size=m)
     matrix = half @ half.T / m + 0.01 * np.eye(m)
     return lambda: Problem.contact(matrix, b, 0.5, friction="cone")
 
 
-def calls(make: Callable[[], Problem], solver: str, limit: float, repeats: int) -> tuple[float, float, Any]:
+def calls(
+    make: Callable[[], Problem], solver: str, limit: float, repeats: int
+) -> tuple[float, float, Any]:
     """Return medians of wall and CPU time divided by the limit, and the last solution."""
-    wall, cpu, found = [], [], None
+    wall = []
+    cpu = []
+    found = None
     for _ in range(repeats):
         problem = make()
         begun, clock = thread_time(), perf_counter()
@@ -110,21 +134,37 @@ def least(make: Callable[[], Problem], call: Callable[[Problem], Any], repeats: 
 
 def draw_program(rng: np.random.Generator) -> dict[str, Any]:
     """Return the arrays of a program of 5 to 1,000 variables: control, linear, contradictory, sparse or dense."""
-    n, kind = round(10.0 ** rng.uniform(np.log10(5.0), 3.0)), rng.integers(5)
+    n = round(10.0 ** rng.uniform(np.log10(5.0), 3.0))
+    kind = rng.integers(5)
 
     def draw(m: int, per_row: float) -> Any:
-        return sp.random(m, n, min(1.0, per_row / n), random_state=rng, data_rvs=rng.standard_normal).tocsc()
+        return sp.random(
+            m, n, min(1.0, per_row / n), random_state=rng, data_rvs=rng.standard_normal
+        ).tocsc()
 
     if kind == 0:  # steps of a mass in three axes with bounds on speed and force
-        steps, dt, one, none = max(1, n // 9), 0.05, np.eye(3), np.zeros((3, 3))
-        move, push = np.block([[one, dt * one], [none, one]]), np.vstack([0.5 * dt * dt * one, dt * one])
+        steps = max(1, n // 9)
+        dt = 0.05
+        one = np.eye(3)
+        none = np.zeros((3, 3))
+        move = np.block([[one, dt * one], [none, one]])
+        push = np.vstack([0.5 * dt * dt * one, dt * one])
         later = sp.kron(sp.eye_array(steps, k=-1), move) - sp.eye_array(6 * steps)
         b = np.zeros(6 * steps)
         b[:3] = rng.normal(size=3)
         high = np.append(np.tile([5.0] * 3 + [0.8] * 3, steps), np.full(3 * steps, 2.0))
-        P = sp.diags_array(np.append(np.tile([10.0] * 3 + [1.0] * 3, steps), np.full(3 * steps, 0.1)))
+        P = sp.diags_array(
+            np.append(np.tile([10.0] * 3 + [1.0] * 3, steps), np.full(3 * steps, 0.1))
+        )
         A = sp.hstack([later, sp.kron(sp.eye_array(steps), push)])
-        return {"P": P.tocsc(), "q": np.zeros(9 * steps), "A": A.tocsc(), "b": b, "lb": -high, "ub": high}
+        return {
+            "P": P.tocsc(),
+            "q": np.zeros(9 * steps),
+            "A": A.tocsc(),
+            "b": b,
+            "lb": -high,
+            "ub": high,
+        }
     if kind == 1:  # a linear program with a degenerate vertex
         m = max(1, n // 3)
         A = (draw(m, 5.0) + sp.eye_array(m, n)).tocsc()
@@ -132,7 +172,8 @@ def draw_program(rng: np.random.Generator) -> dict[str, Any]:
         q = A.T @ rng.normal(size=m) + np.where(x > 0.0, 0.0, rng.uniform(0.1, 1.0, n))
         return {"P": sp.csc_array((n, n)), "q": q, "A": A, "b": A @ x, "lb": np.zeros(n)}
     if kind == 2:  # rows that contradict each other
-        rows, h = draw(n, 4.0), rng.normal(size=n)
+        rows = draw(n, 4.0)
+        h = rng.normal(size=n)
         sides = np.append(h, -h - rng.uniform(0.1, 1.0, n))
         return {
             "P": sp.eye_array(n).tocsc(),
@@ -140,12 +181,25 @@ def draw_program(rng: np.random.Generator) -> dict[str, Any]:
             "G": sp.vstack([rows, -rows]).tocsc(),
             "h": sides,
         }
-    half, A, G, x = draw(n, 3.0), draw(max(1, n // 5), 5.0), draw(n // 2 + 1, 5.0), rng.normal(size=n)
+    half = draw(n, 3.0)
+    A = draw(max(1, n // 5), 5.0)
+    G = draw(n // 2 + 1, 5.0)
+    x = rng.normal(size=n)
     P = (half @ half.T + rng.choice([0.0, 0.1]) * sp.eye_array(n)).tocsc()
     if kind == 3 and n <= 300:
-        P, A = np.eye(n) + half.toarray() @ half.toarray().T, rng.normal(size=A.shape)
+        P = np.eye(n) + half.toarray() @ half.toarray().T
+        A = rng.normal(size=A.shape)
     h = G @ x + rng.uniform(0.0, 0.5, n // 2 + 1) * (rng.random(n // 2 + 1) < 0.7)
-    return {"P": P, "q": rng.normal(size=n), "A": A, "b": A @ x, "G": G, "h": h, "lb": x - 0.5, "ub": x + 1.0}
+    return {
+        "P": P,
+        "q": rng.normal(size=n),
+        "A": A,
+        "b": A @ x,
+        "G": G,
+        "h": h,
+        "lb": x - 0.5,
+        "ub": x + 1.0,
+    }
 
 
 @contextmanager
@@ -173,10 +227,8 @@ def count_foreign_time() -> Iterator[list[float]]:
         def __init__(self, *arguments: Any) -> None:
             self.solve = timed(timed(original)(*arguments).solve)
 
-    original, parts = (
-        clarabel.DefaultSolver,
-        ((qpsolvers, "solve_problem"), (osqp.OSQP, "setup"), (osqp.OSQP, "solve")),
-    )
+    original = clarabel.DefaultSolver
+    parts = ((qpsolvers, "solve_problem"), (osqp.OSQP, "setup"), (osqp.OSQP, "solve"))
     saved = [(owner, name, getattr(owner, name)) for owner, name in parts]
     try:
         clarabel.DefaultSolver = Solver
@@ -193,17 +245,21 @@ def measure_programs(count: int, solvers: tuple[str, ...]) -> list[list[Any]]:
     """Return the rows of the table of `--programs`."""
     own: dict[str, list[float]] = {name: [] for name in solvers}
     for name in solvers:  # Imports, and processes of backends.
-        lv.solve_qp(np.eye(3), -np.ones(3), lb=np.zeros(3), ub=np.full(3, 0.5), solver=name, time_limit=5.0)
+        lv.solve_qp(
+            np.eye(3), -np.ones(3), lb=np.zeros(3), ub=np.full(3, 0.5), solver=name, time_limit=5.0
+        )
         lv.solve_qp(np.eye(1), [0.0], G=[[1.0], [-1.0]], h=[-1.0, -1.0], solver=name)
     rng = np.random.default_rng(0)
     with count_foreign_time() as spent:
         for i in range(count):
-            arrays, limit = draw_program(rng), LIMITS[i % 2]
+            arrays = draw_program(rng)
+            limit = LIMITS[i % 2]
             for name in solvers:
                 problem = lv.Problem.from_qp(**arrays)
                 if get(name).refuses(problem):
                     continue
-                spent[0], begin = 0.0, thread_time()
+                spent[0] = 0.0
+                begin = thread_time()
                 lv.solve_qp(problem, name, tol=1e-6, time_limit=limit)
                 own[name].append(thread_time() - begin - spent[0] - limit)
     rows = []
@@ -232,7 +288,9 @@ def draw_dense_matrix(rng: np.random.Generator, m: int, shift: float) -> Problem
 
 def draw_dense_jacobian(rng: np.random.Generator, m: int, n: int, density: float = 1.0) -> Problem:
     """Draw contacts of three rows of J (m, n) with this fraction of entries, and a full M."""
-    half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=n)
+    half = rng.normal(size=(n, n))
+    jac = rng.normal(size=(m, n))
+    free = rng.normal(size=n)
     if density < 1.0:
         jac *= rng.random((m, n)) < density
     cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
@@ -244,7 +302,9 @@ def draw_bodies(rng: np.random.Generator, kind: str, rows: int) -> tuple[str, Pr
     seed = int(rng.integers(1000))
     if kind == "structure":
         name = str(rng.choice(list(STRUCTURES)))
-        return name, build(name, rows, float(rng.choice([0.0, 0.3])), float(rng.choice([0.0, 1.0])), seed)
+        return name, build(
+            name, rows, float(rng.choice([0.0, 0.3])), float(rng.choice([0.0, 1.0])), seed
+        )
     if kind == "columns":
         height = int(rng.integers(1, 30))
         mu = None if rng.random() < 0.25 else 0.5
@@ -270,18 +330,21 @@ def draw_call(k: int, seed: int) -> tuple[str, Problem, Any, float]:
     """Draw (name, problem, start or None, limit [s]) of a line of the sheet `auto`."""
     rng = np.random.default_rng([seed, k])
     rows = round(np.exp(rng.uniform(np.log(60), np.log(4000))))
-    kind, form = (
-        str(rng.choice(list(KINDS), p=list(KINDS.values()))),
-        str(rng.choice(FORM_NAMES, p=[0.6, 0.2, 0.2])),
-    )
+    kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+    form = str(rng.choice(FORM_NAMES, p=[0.6, 0.2, 0.2]))
     if kind == "dense":
         m = 3 * (min(rows, 600) // 3)
         is_matrix = rng.random() < 0.5
         name = "dense A" if is_matrix else "dense J and M"
-        given = draw_dense_matrix(rng, m, 0.01) if is_matrix else draw_dense_jacobian(rng, m, max(12, m // 4))
+        given = (
+            draw_dense_matrix(rng, m, 0.01)
+            if is_matrix
+            else draw_dense_jacobian(rng, m, max(12, m // 4))
+        )
     else:
         name, given = draw_bodies(rng, kind, rows)
-    problem, start = convert(rng, given, form), None
+    problem = convert(rng, given, form)
+    start = None
     if rng.random() < 0.67:
         noise = 0.3 * problem.b * rng.standard_normal(problem.m)
         other = problem.updated(
@@ -310,36 +373,84 @@ def measure_auto(k: int, seed: int) -> Line:
             solution = lv.solve(cold, solver, impulse=start, tol=TOLERANCE, time_limit=limit)
             time = thread_time() - begun
             runs[i, j] = solution.residual.relative, time / limit
-    (own, over), others = np.median(runs, axis=0)[0], np.median(runs, axis=0)[1:, 0]
+    (own, over) = np.median(runs, axis=0)[0]
+    others = np.median(runs, axis=0)[1:, 0]
     at_start = lv.residual(problem, problem.start() if start is None else start).relative
     ratio = max(own, TOLERANCE) / max(others.min(), TOLERANCE)
     best = names[1 + int(others.argmin())]
-    return {"name": name, "rows": problem.m, "limit": limit, "residual": own, "best": others.min(), "by": best,
-            "at start": at_start, "ratio": ratio, "time": over}  # fmt: skip
+    return {
+        "name": name,
+        "rows": problem.m,
+        "limit": limit,
+        "residual": own,
+        "best": others.min(),
+        "by": best,
+        "at start": at_start,
+        "ratio": ratio,
+        "time": over,
+    }
 
 
 def print_auto(lines: list[Line], worst: int) -> None:
     """Print the figures of the sheet `auto`, and the lines with the largest ratios."""
     ratio, time = (np.array([line[key] for line in lines]) for key in ("ratio", "time"))
-    click.echo(markdown(["figure", "value"], [
-        ["residual of `auto` over that of the best sweeps, geometric mean", f"{np.exp(np.log(ratio).mean()):.2f}"],
-        ["the same, of ratios above 1", f"{np.exp(np.log(np.maximum(ratio, 1.0)).mean()):.2f}"],
-        ["above 10 times", str(int((ratio > 10.0).sum()))],
-        ["worse than the start", str(sum(line["residual"] > line["at start"] * (1 + 1e-9) for line in lines))],
-        ["time over the limit, median, 95 %, worst", ", ".join(f"{x:.2f}" for x in np.quantile(time, (0.5, 0.95, 1)))],
-    ]))  # fmt: skip
+    click.echo(
+        markdown(
+            ["figure", "value"],
+            [
+                [
+                    "residual of `auto` over that of the best sweeps, geometric mean",
+                    f"{np.exp(np.log(ratio).mean()):.2f}",
+                ],
+                [
+                    "the same, of ratios above 1",
+                    f"{np.exp(np.log(np.maximum(ratio, 1.0)).mean()):.2f}",
+                ],
+                ["above 10 times", str(int((ratio > 10.0).sum()))],
+                [
+                    "worse than the start",
+                    str(sum(line["residual"] > line["at start"] * (1 + 1e-9) for line in lines)),
+                ],
+                [
+                    "time over the limit, median, 95 %, worst",
+                    ", ".join(f"{x:.2f}" for x in np.quantile(time, (0.5, 0.95, 1))),
+                ],
+            ],
+        )
+    )
     head = ["problem", "rows", "limit [ms]", "`auto`", "best sweeps", "start", "time/limit"]
-    click.echo("\n" + markdown(head, [
-        [x["name"], x["rows"], f"{1e3 * x['limit']:.2f}", f"{x['residual']:.1e}", f"{x['best']:.1e} {x['by']}",
-         f"{x['at start']:.1e}", f"{x['time']:.2f}"]
-        for x in sorted(lines, key=lambda x: -x["ratio"])[:worst]]))  # fmt: skip
+    click.echo(
+        "\n"
+        + markdown(
+            head,
+            [
+                [
+                    x["name"],
+                    x["rows"],
+                    f"{1e3 * x['limit']:.2f}",
+                    f"{x['residual']:.1e}",
+                    f"{x['best']:.1e} {x['by']}",
+                    f"{x['at start']:.1e}",
+                    f"{x['time']:.2f}",
+                ]
+                for x in sorted(lines, key=lambda x: -x["ratio"])[:worst]
+            ],
+        )
+    )
 
 
 def measure_prepared(k: int, seed: int) -> list[Line]:
     """Measure the own solvers on a problem of the sheet `prepared`."""
     rng = np.random.default_rng([seed, k, 1])
     m = 3 * round(np.exp(rng.uniform(np.log(100), np.log(1000))))
-    name = ("dense A", "sparse A", "bodies", "dense J and M", "sparse J and M", "J and M of bodies")[k % 6]
+    name = (
+        "dense A",
+        "sparse A",
+        "bodies",
+        "dense J and M",
+        "sparse J and M",
+        "J and M of bodies",
+    )[k % 6]
     if name == "dense A":
         problem = draw_dense_matrix(rng, m, 0.05)
     elif name.endswith("J and M"):
@@ -350,33 +461,63 @@ def measure_prepared(k: int, seed: int) -> list[Line]:
         kind = str(rng.choice(["structure", "columns"]))
         form = {"sparse A": "matrix", "J and M of bodies": "J and M"}.get(name, "bodies")
         problem = convert(rng, draw_bodies(rng, kind, m)[1], form)
-    limit, lines = float(np.exp(rng.uniform(np.log(1e-3), np.log(5e-2)))), []
+    limit = float(np.exp(rng.uniform(np.log(1e-3), np.log(5e-2))))
+    lines = []
     for solver, spec in registry.specs().items():
         if not spec.builtin or spec.external or spec.refuses(problem):
             continue
         prepared = lv.prepare(fresh(problem), solver)
         for _ in range(3):
-            b, begun = problem.b * (1.0 + 0.01 * rng.random()), thread_time()
+            b = problem.b * (1.0 + 0.01 * rng.random())
+            begun = thread_time()
             status = prepared.solve(b=b, tol=1e-8, time_limit=limit).status
             time = thread_time() - begun
-            lines.append({"name": f"{name}, {problem.law}", "rows": problem.m, "solver": solver, "limit": limit,
-                          "time": time, "excess": time - 2.0 * limit, "status": status.name})  # fmt: skip
+            lines.append(
+                {
+                    "name": f"{name}, {problem.law}",
+                    "rows": problem.m,
+                    "solver": solver,
+                    "limit": limit,
+                    "time": time,
+                    "excess": time - 2.0 * limit,
+                    "status": status.name,
+                }
+            )
     return lines
 
 
 def print_prepared(lines: list[Line], worst: int) -> None:
     """Print the figures of the sheet `prepared`, and the lines with the largest times over 2 L."""
     excess = np.array([line["excess"] for line in lines])
-    click.echo(markdown(["figure", "value"], [
-        ["solves", str(len(lines))],
-        ["CPU time at most 2 L + 5 ms", f"{np.mean(excess <= 5e-3):.2%}"],
-        ["CPU time at most 2 L + 25 ms", f"{np.mean(excess <= 25e-3):.2%}"],
-        ["largest time over 2 L", f"{1e3 * excess.max():.1f} ms"],
-    ]))  # fmt: skip
+    click.echo(
+        markdown(
+            ["figure", "value"],
+            [
+                ["solves", str(len(lines))],
+                ["CPU time at most 2 L + 5 ms", f"{np.mean(excess <= 5e-3):.2%}"],
+                ["CPU time at most 2 L + 25 ms", f"{np.mean(excess <= 25e-3):.2%}"],
+                ["largest time over 2 L", f"{1e3 * excess.max():.1f} ms"],
+            ],
+        )
+    )
     head = ["problem", "rows", "solver", "limit [ms]", "time [ms]", "status"]
-    click.echo("\n" + markdown(head, [
-        [x["name"], x["rows"], x["solver"], f"{1e3 * x['limit']:.1f}", f"{1e3 * x['time']:.1f}", x["status"]]
-        for x in sorted(lines, key=lambda x: -x["excess"])[:worst]]))  # fmt: skip
+    click.echo(
+        "\n"
+        + markdown(
+            head,
+            [
+                [
+                    x["name"],
+                    x["rows"],
+                    x["solver"],
+                    f"{1e3 * x['limit']:.1f}",
+                    f"{1e3 * x['time']:.1f}",
+                    x["status"],
+                ]
+                for x in sorted(lines, key=lambda x: -x["excess"])[:worst]
+            ],
+        )
+    )
 
 
 def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
@@ -402,7 +543,9 @@ def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
 @click.option("--repeats", default=5, show_default=True)
 @click.option("--programs", default=0, help="Number of quadratic programs, in place of cases.")
 @click.option(
-    "--sheet", type=click.Choice(["auto", "prepared"]), help="Drawn contact problems, in place of cases."
+    "--sheet",
+    type=click.Choice(["auto", "prepared"]),
+    help="Drawn contact problems, in place of cases.",
 )
 @click.option("--count", default=400, show_default=True, help="Number of problems of a sheet.")
 @click.option("--seed", default=0, show_default=True)
@@ -420,7 +563,13 @@ def command(
         print_sheet(sheet, count, seed)
         return
     if programs:
-        head = ["solver", "programs", "within limit + 5 ms", "above the limit in 1 % [ms]", "largest [ms]"]
+        head = [
+            "solver",
+            "programs",
+            "within limit + 5 ms",
+            "above the limit in 1 % [ms]",
+            "largest [ms]",
+        ]
         click.echo(markdown(head, measure_programs(programs, solvers)))
         return
     lv.solve(problem_of("dense 30 x 20")(), time_limit=1e-2)
@@ -448,7 +597,18 @@ def command(
                 continue
             for limit in LIMITS:
                 wall, cpu, found = calls(make, solver, limit, repeats)
-                rows.append([name, problem.m, solver, f"{1e3 * alone:.2f}", f"{1e3 * limit:g}", f"{wall:.2f}",
-                             f"{cpu:.2f}", found.iterations, f"{found.residual.relative:.1e}",
-                             f"{start:.1e}"])  # fmt: skip
+                rows.append(
+                    [
+                        name,
+                        problem.m,
+                        solver,
+                        f"{1e3 * alone:.2f}",
+                        f"{1e3 * limit:g}",
+                        f"{wall:.2f}",
+                        f"{cpu:.2f}",
+                        found.iterations,
+                        f"{found.residual.relative:.1e}",
+                        f"{start:.1e}",
+                    ]
+                )
     click.echo(markdown(head, rows))

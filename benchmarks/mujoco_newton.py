@@ -67,8 +67,10 @@ def collect_states(path: Path, mujoco: Any) -> Iterator[tuple[Any, Any, np.ndarr
     except (ValueError, mujoco.FatalError) as error:
         click.echo(f"{path.name}: {error}", err=True)
         return
-    model.opt.solver, model.opt.noslip_iterations = mujoco.mjtSolver.mjSOL_NEWTON, 0
-    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model.opt.noslip_iterations = 0
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     for step in range(STEPS_BEFORE + STEPS_BETWEEN * STATES_PER_MODEL):
         if model.nu and step % STEPS_PER_CONTROL == 0:
@@ -81,7 +83,9 @@ def collect_states(path: Path, mujoco: Any) -> Iterator[tuple[Any, Any, np.ndarr
             mujoco.mj_setState(model, data, state, kind)
 
 
-def measure_mujoco(mujoco: Any, model: Any, data: Any, state: np.ndarray, repeats: int) -> tuple[Any, float]:
+def measure_mujoco(
+    mujoco: Any, model: Any, data: Any, state: np.ndarray, repeats: int
+) -> tuple[Any, float]:
     """Return the problem of a state and the smallest time [s] of MuJoCo's solver, NaN if it does not reach TOL."""
     tolerance, steps = model.opt.tolerance, model.opt.iterations
 
@@ -97,12 +101,15 @@ def measure_mujoco(mujoco: Any, model: Any, data: Any, state: np.ndarray, repeat
             stage(model, data)
 
     try:
-        model.opt.iterations, model.opt.tolerance = MAX_MUJOCO_STEPS, 0.0
+        model.opt.iterations = MAX_MUJOCO_STEPS
+        model.opt.tolerance = 0.0
         begin_solve()
         mujoco.mj_fwdConstraint(model, data)
         problem = lv.io.from_mujoco(model, data)
         for model.opt.tolerance in TOLERANCES:
-            elapsed = measure_minimum(lambda: mujoco.mj_fwdConstraint(model, data), begin_solve, repeats)
+            elapsed = measure_minimum(
+                lambda: mujoco.mj_fwdConstraint(model, data), begin_solve, repeats
+            )
             if lv.residual(problem, reader.impulse(model, data)).relative <= TOL:
                 return problem, elapsed
         return problem, np.nan
@@ -129,7 +136,10 @@ def measure_lavender(problem: Problem, repeats: int, worlds: int) -> tuple[bool,
 
     found = lv.solve(copy_problem(problem), tol=TOL).residual
     single = measure_minimum(lambda: lv.solve(copies[0], tol=TOL), copy_one, repeats)
-    many = measure_minimum(lambda: lv.solve_many(copies, tol=TOL), copy_all, max(2, repeats // 4)) / worlds
+    many = (
+        measure_minimum(lambda: lv.solve_many(copies, tol=TOL), copy_all, max(2, repeats // 4))
+        / worlds
+    )
     return found.relative <= max(TOL, 2.0 * found.roundoff_floor), single, many
 
 
@@ -157,10 +167,15 @@ def print_table(lines: list[dict[str, Any]]) -> None:
     for name in dict.fromkeys(x["class"] for x in sorted(lines, key=lambda x: x["m"])):
         group = [x for x in lines if x["class"] == name]
         times = [compute_mean([x[key] for x in group]) for key in ("mujoco", "solve", "many")]
-        rows.append([
-            name, str(len({x["model"] for x in group})), str(len(group)), *(f"{1e6 * t:.1f}" for t in times),
-            *(f"{t / times[0]:.2f}" for t in times[1:]),
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                str(len({x["model"] for x in group})),
+                str(len(group)),
+                *(f"{1e6 * t:.1f}" for t in times),
+                *(f"{t / times[0]:.2f}" for t in times[1:]),
+            ]
+        )
     head = [
         "rows",
         "models",
@@ -175,18 +190,28 @@ def print_table(lines: list[dict[str, Any]]) -> None:
 
 
 @click.command("mujoco_newton")
-@click.option("--models", multiple=True, type=click.Path(path_type=Path, exists=True),
-              help="Folder with scenes of MuJoCo, besides the models of dm_control and gymnasium.")  # fmt: skip
-@click.option("--repeats", default=12, show_default=True, help="Number of measurements of each call.")
 @click.option(
-    "--worlds", default=32, show_default=True, help="Number of problems of each call of `solve_many`."
+    "--models",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Folder with scenes of MuJoCo, besides the models of dm_control and gymnasium.",
+)
+@click.option(
+    "--repeats", default=12, show_default=True, help="Number of measurements of each call."
+)
+@click.option(
+    "--worlds",
+    default=32,
+    show_default=True,
+    help="Number of problems of each call of `solve_many`.",
 )
 @out_option("Write every measurement to this JSON file.")
 def command(models: tuple[Path, ...], repeats: int, worlds: int, out: Path | None) -> None:
     """Compare `solve` and `solve_many` with MuJoCo's Newton solver on the same rows."""
     import mujoco
 
-    lines, counts = [], {"refused": 0, "unsolved by MuJoCo": 0, "unsolved by lavender": 0}
+    lines = []
+    counts = {"refused": 0, "unsolved by MuJoCo": 0, "unsolved by lavender": 0}
     for path in list_models(models):
         for model, data, state in collect_states(path, mujoco):
             try:
@@ -200,10 +225,16 @@ def command(models: tuple[Path, ...], repeats: int, worlds: int, out: Path | Non
             counts["unsolved by MuJoCo"] += not np.isfinite(reference)
             counts["unsolved by lavender"] += not solved
             if solved and np.isfinite(reference):
-                lines.append({
-                    "model": "/".join(path.parts[-2:]), "m": problem.m, "class": name_class(problem.m),
-                    "mujoco": reference, "solve": single, "many": many,
-                })  # fmt: skip
+                lines.append(
+                    {
+                        "model": "/".join(path.parts[-2:]),
+                        "m": problem.m,
+                        "class": name_class(problem.m),
+                        "mujoco": reference,
+                        "solve": single,
+                        "many": many,
+                    }
+                )
     print_table(lines)
     click.echo("\n" + ", ".join(f"{n} {name}" for name, n in counts.items()))
     if out is not None:

@@ -17,12 +17,15 @@ from lavender.report import machine
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return a markdown table. Columns of numbers are not aligned specially, so that diffs stay small."""
     lines = [
-        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in (head, *rows)
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |"
+        for line in (head, *rows)
     ]
     return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
-def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def out_option(
+    text: str, name: str = "--out"
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return the option `--out FILE`; the command receives a writable path or None."""
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
@@ -34,5 +37,10 @@ def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]],
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
     """Write lines (dataclasses or dictionaries) with machine and package versions; the file is written atomically."""
     rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
-    more = {"cpu": machine.get_cpu_name(), "versions": machine.get_versions(), **more, "lines": rows}
+    more = {
+        "cpu": machine.get_cpu_name(),
+        "versions": machine.get_versions(),
+        **more,
+        "lines": rows,
+    }
     write_text(path, json.dumps(more, indent=1) + "\n")

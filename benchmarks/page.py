@@ -57,11 +57,15 @@ def browse(**options):
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
-        raise SolverUnavailable("playwright is not installed: pip install 'lavender-contact[dev]'") from None
+        raise SolverUnavailable(
+            "playwright is not installed: pip install 'lavender-contact[dev]'"
+        ) from None
     names = ("chromium", "chromium-browser", "google-chrome")
     browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     if browser_path is None:
-        raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+        raise SolverUnavailable(
+            f"none of {', '.join(names)} is installed, and CHROMIUM names no browser"
+        )
     with sync_playwright() as p:
         # In containers and as root there are no user namespaces for the sandbox.
         browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
@@ -107,7 +111,9 @@ def measured(page, seconds):
     before = spent(session)
     page.evaluate(COUNT)
     page.wait_for_timeout(1000 * seconds)
-    found = page.evaluate("() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})")
+    found = page.evaluate(
+        "() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})"
+    )
     thread = spent(session) - before
     dt = page.evaluate("lavender.scene.dt")
     page.evaluate("lavender.play(false)")

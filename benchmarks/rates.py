@@ -40,11 +40,30 @@ STORED_WEIGHT = 0.5  # Weight of a stored rate, compared with 1 for each measure
 SETUP_CASES = (*CASES[1:-1], "granularF(n=5) as matrix", "granularF(n=5) as J and M", "matrix 1200")
 SETUP_SOLVERS = ("newton", "direct")
 SETUP_RATES = (
-    "set-up", "form row", "form entry", "form product", "scipy calls", "layout entry", "full layout entry",
-    "analysis entry", "full analysis entry", "body elimination", "velocity elimination", "judge entry",
-)  # fmt: skip
-NEWTON_RATES = ("start", "row", "entry", "bodies", "dense", "panels", "velocities", "velocity row",
-                "velocity contact row")  # fmt: skip
+    "set-up",
+    "form row",
+    "form entry",
+    "form product",
+    "scipy calls",
+    "layout entry",
+    "full layout entry",
+    "analysis entry",
+    "full analysis entry",
+    "body elimination",
+    "velocity elimination",
+    "judge entry",
+)
+NEWTON_RATES = (
+    "start",
+    "row",
+    "entry",
+    "bodies",
+    "dense",
+    "panels",
+    "velocities",
+    "velocity row",
+    "velocity contact row",
+)
 PIVOT_RATES = ("pivot row", "pivot work")
 SWEEP_RATES = ("sweep row", "sweep entry", "sweep cone", "sweep body cone", "sweep velocities")
 MEASURED_SWEEPS = 100  # The first sweeps cost more, and `auto` uses about as many.
@@ -60,17 +79,27 @@ def fit_rates(names: tuple[str, ...], lines: list[Line]) -> Fit:
     proportional to each other in all problems keep the ratio of their rates.
     """
     stored = np.array([get_stored(name) for name in names])
-    table = np.array([[counts.get(name, 0.0) / time for name in names] for _, counts, time in lines]) * stored
+    table = (
+        np.array([[counts.get(name, 0.0) / time for name in names] for _, counts, time in lines])
+        * stored
+    )
     known = table.any(axis=0)
     equations = np.vstack([table, STORED_WEIGHT * np.eye(len(names))])
-    found = stored * nnls(equations, np.append(np.ones(len(lines)), np.full(len(names), STORED_WEIGHT)))[0]
-    return {name: float(x) for name, x, is_known in zip(names, found, known, strict=True) if is_known}
+    found = (
+        stored
+        * nnls(equations, np.append(np.ones(len(lines)), np.full(len(names), STORED_WEIGHT)))[0]
+    )
+    return {
+        name: float(x) for name, x, is_known in zip(names, found, known, strict=True) if is_known
+    }
 
 
 def get_stored(name: str) -> float:
     """Return the stored rate of this name; set-ups are stored with their margin."""
     work = costs.RATES["work"]
-    value = float(work[name] if name in work else costs.RATES["entry" if name == "sweep entry" else name])
+    value = float(
+        work[name] if name in work else costs.RATES["entry" if name == "sweep entry" else name]
+    )
     return value / SETUP_MARGIN if name in SETUP_RATES else value
 
 
@@ -114,9 +143,11 @@ def newton_lines() -> Iterator[Line]:
                 each = steps / max(1, state.general.islands)
                 contact_rows = 0 if law == "lcp" else problem.m
                 counts = {
-                    "entry": each * problem.metric.work, "velocities": each * state.general.work,
-                    "velocity row": each * (problem.m - contact_rows), "velocity contact row": each * contact_rows,
-                }  # fmt: skip
+                    "entry": each * problem.metric.work,
+                    "velocities": each * state.general.work,
+                    "velocity row": each * (problem.m - contact_rows),
+                    "velocity contact row": each * contact_rows,
+                }
             else:
                 c = state.count
                 counts = {
@@ -143,9 +174,15 @@ def pivot_lines() -> Iterator[Line]:
                 continue
             width = 1.0 + max(problem.bandwidth)
             setup = least(lambda p=problem: fresh(p), get("direct").load()().prepare)  # type: ignore[misc]
-            time = 1e9 * (least(lambda p=problem: fresh(p), lambda p: lv.solve(p, "direct")) - setup)  # type: ignore[misc]
+            time = 1e9 * (
+                least(lambda p=problem: fresh(p), lambda p: lv.solve(p, "direct")) - setup
+            )  # type: ignore[misc]
             if time > 0.0:
-                yield f"{kind} {m}", {"pivot row": steps * m, "pivot work": steps * m * width**2}, time
+                yield (
+                    f"{kind} {m}",
+                    {"pivot row": steps * m, "pivot work": steps * m * width**2},
+                    time,
+                )
 
 
 def sweep_lines() -> Iterator[Line]:
@@ -221,7 +258,9 @@ def setup_lines() -> Iterator[Line]:
     for name in SETUP_CASES:
         for label, estimate, seconds in measure_setups(name):
             fixed = estimate_with(estimate, none)
-            counts = {key: estimate_with(estimate, none | {key: 1.0}) - fixed for key in SETUP_RATES}
+            counts = {
+                key: estimate_with(estimate, none | {key: 1.0}) - fixed for key in SETUP_RATES
+            }
             yield f"{name}: {label}", counts, max(1e9 * seconds - fixed, 1.0)
 
 
@@ -230,10 +269,19 @@ def measure_rates() -> dict[str, Any]:
     newton = fit_rates(NEWTON_RATES, list(newton_lines()))
     pivot = fit_rates(PIVOT_RATES, list(pivot_lines()))
     sweep = fit_rates(SWEEP_RATES, list(sweep_lines()))
-    setup = {name: SETUP_MARGIN * x for name, x in fit_rates(SETUP_RATES, list(setup_lines())).items()}
+    setup = {
+        name: SETUP_MARGIN * x for name, x in fit_rates(SETUP_RATES, list(setup_lines())).items()
+    }
     sweep.pop("sweep entry", None)
     work = {form: newton.pop(form) for form in costs.RATES["work"] if form in newton}
-    measured: dict[str, Any] = {**costs.RATES, **newton, **pivot, **sweep, **setup, **measure_kernels()}
+    measured: dict[str, Any] = {
+        **costs.RATES,
+        **newton,
+        **pivot,
+        **sweep,
+        **setup,
+        **measure_kernels(),
+    }
     return measured | {"work": costs.RATES["work"] | work}
 
 

@@ -53,7 +53,8 @@ def get_state(model: Any, data: Any) -> Any:
 
 def is_moved_by_acceleration(model: Any) -> bool:
     """Return whether the integrator uses qacc: Euler without damping, discrete, the first pass of RK4."""
-    integrator, off = mujoco.mjtIntegrator, int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    integrator = mujoco.mjtIntegrator
+    off = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     if model.opt.integrator == integrator.mjINT_EULER:
         return bool(model.opt.disableflags & off) or not np.array(model.dof_damping).any()
     return model.opt.integrator not in (integrator.mjINT_IMPLICIT, integrator.mjINT_IMPLICITFAST)
@@ -66,7 +67,9 @@ def compute_error(model: Any, state: Any) -> tuple[float, int, int]:
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, state, STATE)
     mujoco.mj_forward(model, data)
-    m, nv, dt = int(data.nefc), model.nv, model.opt.timestep
+    m = int(data.nefc)
+    nv = model.nv
+    dt = model.opt.timestep
     contacts = int(np.count_nonzero(data.contact.efc_address >= 0)) if data.ncon else 0
     if m == 0:
         return 0.0, 0, contacts
@@ -82,13 +85,17 @@ def compute_error(model: Any, state: Any) -> tuple[float, int, int]:
     if is_moved_by_acceleration(model):
         exact = mujoco.MjData(model)
         mujoco.mj_setState(model, exact, state, STATE)
-        mujoco.mj_forward(apply_options(model, (CONVERGED_OPTIONS | {"ls_iterations": 300}).items()), exact)
+        mujoco.mj_forward(
+            apply_options(model, (CONVERGED_OPTIONS | {"ls_iterations": 300}).items()), exact
+        )
         return float(dt * np.abs(jac @ (data.qacc - exact.qacc)).max()), m, contacts
     row_type, force = np.array(data.efc_type), np.array(data.efc_force)
     acceleration = data.qacc_smooth + solved.T @ force
     slack = dt * (jac @ acceleration + data.efc_R * force - data.efc_aref)
     diagonal = np.einsum("ij,ij->i", jac, solved) + data.efc_R
-    impulse, loss, errors = dt * force, dt * np.array(data.efc_frictionloss), np.zeros(m)
+    impulse = dt * force
+    loss = dt * np.array(data.efc_frictionloss)
+    errors = np.zeros(m)
     is_equality = row_type == KIND.mjCNSTR_EQUALITY
     is_loss = (row_type == KIND.mjCNSTR_FRICTION_DOF) | (row_type == KIND.mjCNSTR_FRICTION_TENDON)
     low = np.where(is_equality, -np.inf, np.where(is_loss, -loss, 0.0))
@@ -101,7 +108,10 @@ def compute_error(model: Any, state: Any) -> tuple[float, int, int]:
             rows = slice(first, first + dim)
             scale = np.concatenate([[1.0], contact.friction[: dim - 1] / contact.friction[0]])
             errors[rows] = compute_cone_errors(
-                impulse[rows] / scale, slack[rows] * scale, diagonal[rows] * scale**2, contact.friction[0]
+                impulse[rows] / scale,
+                slack[rows] * scale,
+                diagonal[rows] * scale**2,
+                contact.friction[0],
             )
     return float(errors.max()), m, contacts
 
@@ -148,7 +158,8 @@ def project_on_cone(y: Any, d: Any, mu: float) -> Any:
 
 def simulate(model: Any, world: int, steps: int, starts: Any) -> Any:
     """Return the states before the steps of a world with random controls and velocities, as the pages describe it."""
-    data, seed = mujoco.MjData(model), 0
+    data = mujoco.MjData(model)
+    seed = 0
     exact = 1 if starts is None else len(starts)
     if starts is not None:
         mujoco.mj_setState(model, data, starts.vectors[world % exact], STATE)
@@ -156,7 +167,8 @@ def simulate(model: Any, world: int, steps: int, starts: Any) -> Any:
         data.qvel[:] += 0.1 * np.random.default_rng([seed, world]).standard_normal(model.nv)
     limited = np.array(model.actuator_ctrllimited, bool)[:, None]
     low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
-    rng, states = np.random.default_rng(seed + world), []
+    rng = np.random.default_rng(seed + world)
+    states = []
     for step in range(steps):
         ctrl = rng.uniform(low, high)
         if step or starts is None or starts.controls is None:
@@ -175,7 +187,9 @@ def compare(found: Any, expected: Any, floor: float = ROUNDING) -> float:
     return float(np.max(gap, initial=0.0))
 
 
-def recompute_audit(source: Any, model: Any, worlds: int, steps: int, states: Any) -> dict[str, float]:
+def recompute_audit(
+    source: Any, model: Any, worlds: int, steps: int, states: Any
+) -> dict[str, float]:
     """Compare an audit with plain MuJoCo."""
     found = audit(source, worlds=worlds, steps=steps, spread=0.1, states=states, workers=1)
     starts = None if states is None else read_states(mujoco, model, states).select_evenly(worlds)
@@ -201,8 +215,11 @@ def recompute_audit(source: Any, model: Any, worlds: int, steps: int, states: An
 def apply_options(model: Any, options: Any) -> Any:
     """Return a copy of the model with options (name, value), whose values may be texts."""
     changed = copy.copy(model)
-    kinds = {"solver": (mujoco.mjtSolver, "mjSOL_"), "jacobian": (mujoco.mjtJacobian, "mjJAC_"),
-             "cone": (mujoco.mjtCone, "mjCONE_")}  # fmt: skip
+    kinds = {
+        "solver": (mujoco.mjtSolver, "mjSOL_"),
+        "jacobian": (mujoco.mjtJacobian, "mjJAC_"),
+        "cone": (mujoco.mjtCone, "mjCONE_"),
+    }
     for name, value in options:
         if name in kinds:
             kind, prefix = kinds[name]
@@ -231,20 +248,30 @@ def apply_text(model: Any, text: str) -> Any:
     return changed
 
 
-def recompute_tune(source: Any, model: Any, worlds: int, steps: int, states: Any) -> dict[str, float]:
+def recompute_tune(
+    source: Any, model: Any, worlds: int, steps: int, states: Any
+) -> dict[str, float]:
     """Compare a tuning with plain MuJoCo, except its times."""
     found = tune(source, worlds=worlds, steps=steps, spread=0.1, states=states, repeats=1)
     starts = None if states is None else read_states(mujoco, model, states).select_evenly(worlds)
     halves = [
-        np.concatenate([simulate(model, w, steps, starts).reshape(-1, 10, len(simulate(model, w, 1, starts)[0]))
-                        for w in range(half, worlds, 2)])
+        np.concatenate(
+            [
+                simulate(model, w, steps, starts).reshape(
+                    -1, 10, len(simulate(model, w, 1, starts)[0])
+                )
+                for w in range(half, worlds, 2)
+            ]
+        )
         for half in (0, 1)
-    ]  # fmt: skip
+    ]
     gaps = {"tune: error of each step": 0.0, "tune: 99 % and maximum": 0.0, "tune: motion": 0.0}
 
     def run(options: Any, stretches: Any, with_errors: bool = True) -> tuple[Any, Any]:
         """Return errors of all steps and the positions at the ends of stretches with some options."""
-        changed, errors, ends = apply_options(model, options), [], []
+        changed = apply_options(model, options)
+        errors = []
+        ends = []
         for stretch in stretches:
             data, vectors = mujoco.MjData(changed), mujoco.MjData(model)
             mujoco.mj_setState(changed, data, stretch[0], STATE)
@@ -293,7 +320,8 @@ def compute_slips(model: Any, before: Any, velocity: Any) -> dict[str, list[floa
             mujoco.mj_jac(model, data, jac, None, contact.pos, int(model.geom_bodyid[geom]))
         tangents = contact.frame.reshape(3, 3)[1:]
         name = ", ".join(
-            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g)) for g in contact.geom
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g))
+            for g in contact.geom
         )
         slips.setdefault(name, []).append(
             float(np.linalg.norm(tangents @ (jacobians[1] - jacobians[0]) @ velocity))
@@ -322,7 +350,9 @@ def recompute_slip(model: Any, vectors: Any) -> dict[str, float]:
         return {}
     table = result.table.set_index("contact")
     gaps = {
-        "slip: mean speed": max(compare(table.loc[n, "slip [m/s]"], np.mean(x)) for n, x in points.items()),
+        "slip: mean speed": max(
+            compare(table.loc[n, "slip [m/s]"], np.mean(x)) for n, x in points.items()
+        ),
         "slip: points": max(compare(table.loc[n, "points"], len(x)) for n, x in points.items()),
     }
     worst = result.worst
@@ -332,7 +362,9 @@ def recompute_slip(model: Any, vectors: Any) -> dict[str, float]:
         ranked = []
         for i in used:
             slips = {s.contact: s.speed for s in result.explanations[used.index(i)].slips}
-            own = [x for contact, x in slips.items() if contact.partition(" (")[2].rstrip(")") == name]
+            own = [
+                x for contact, x in slips.items() if contact.partition(" (")[2].rstrip(")") == name
+            ]
             if own:
                 ranked.append((float(np.mean(own)), used.index(i), i))
         chosen = [i for *_, i in sorted(ranked, reverse=True)[:8]]
@@ -356,7 +388,8 @@ def recompute_slip(model: Any, vectors: Any) -> dict[str, float]:
 
 def simulate_slip(model: Any, state: Any, name: str) -> tuple[float, float, int]:
     """Return the slip of two geoms in a step, its mean in the next 25, and the step of a restart by MuJoCo or -1."""
-    data, means = mujoco.MjData(model), []
+    data = mujoco.MjData(model)
+    means = []
     mujoco.mj_setState(model, data, state, STATE)
     for step in range(REMEDY_STEPS + 1):
         before = get_state(model, data)

@@ -59,7 +59,9 @@ def draw_from_generators(rng: np.random.Generator, seed: int) -> Problem:
         n = max(6, round(contacts * rng.uniform(0.5, 2.0)))
         soft = bool(rng.random() < 0.5)
         spin = bool(rng.random() < 0.2)
-        return random_generalized_problem(seed, law, n=n, compliance=soft, contacts=contacts, spin=spin)
+        return random_generalized_problem(
+            seed, law, n=n, compliance=soft, contacts=contacts, spin=spin
+        )
     bodies = max(3, round(rows / rng.uniform(6.0, 15.0)))
     contacts = max(2, rows // 4)
     problem = CONTACTS[kind](seed, law, bodies=bodies, joints=max(1, rows // 12), contacts=contacts)
@@ -73,12 +75,21 @@ def draw_from_suite(rng: np.random.Generator, _seed: int) -> Problem:
     ratio = 10.0 ** float(rng.choice([0, 0, 1, 2, 3]))
     law = str(rng.choice(LAW_NAMES))
     seed = int(rng.integers(1, 1000))
-    name = str(rng.choice([
-        f"box_stackF(n={k}, mass_ratio={ratio:g})", f"box_stack(n={k}, mass_ratio={ratio:g})",
-        f"pyramidF(k={min(k, 9)}, mass_ratio={ratio:g})", f"pyramid(k={min(k, 9)}, mass_ratio={ratio:g})",
-        f"granular(n={min(k, 9)})", f"granularF(n={min(k, 9)})", f"chain(n={8 * k})", f"stack(n={16 * k})",
-        f"random_spd(n={20 * k}, seed={seed})",
-    ]))  # fmt: skip
+    name = str(
+        rng.choice(
+            [
+                f"box_stackF(n={k}, mass_ratio={ratio:g})",
+                f"box_stack(n={k}, mass_ratio={ratio:g})",
+                f"pyramidF(k={min(k, 9)}, mass_ratio={ratio:g})",
+                f"pyramid(k={min(k, 9)}, mass_ratio={ratio:g})",
+                f"granular(n={min(k, 9)})",
+                f"granularF(n={min(k, 9)})",
+                f"chain(n={8 * k})",
+                f"stack(n={16 * k})",
+                f"random_spd(n={20 * k}, seed={seed})",
+            ]
+        )
+    )
     problem = lv.suite.case(name).problem
     if problem.law in LAW_NAMES:
         problem = replace(problem, friction=law)
@@ -162,13 +173,19 @@ def classify(problem: Problem) -> str:
     edges = (10, *SIZE_LIMITS, MAX_ROWS)
     k = sum(problem.m > edge for edge in SIZE_LIMITS)
     rigid = " rigid" if problem.generalized is not None and not np.all(problem.compliance) else ""
-    form = {"rows": "bodies", "matrix": "matrix", "generalized": f"J and M{rigid}"}[problem.operator]
+    form = {"rows": "bodies", "matrix": "matrix", "generalized": f"J and M{rigid}"}[
+        problem.operator
+    ]
     return f"{edges[k]}-{edges[k + 1]}, {problem.law}, {form}"
 
 
 def measure(problem: Problem) -> dict[str, Any] | None:
     """Return the times [s] of `auto`, of the solvers by name and of the rule; None if no solver solves the problem."""
-    others = [name for name, spec in specs().items() if spec.builtin and not spec.external and name != "auto"]
+    others = [
+        name
+        for name, spec in specs().items()
+        if spec.builtin and not spec.external and name != "auto"
+    ]
     names = [name for name in others if not specs()[name].refuses(problem)]
     begun = perf_counter()
     first, solution = call(problem, "auto")
@@ -186,24 +203,34 @@ def measure(problem: Problem) -> dict[str, Any] | None:
         return None
     fastest = min(times.values())
     close = {name for name, taken in times.items() if taken <= CLOSE_RATIO * fastest + 2 * SHIFT}
-    again = list(dict.fromkeys([n for n in ("auto", "newton", "anderson") if n in times] + sorted(close)))
-    begun, runs = perf_counter(), 0
+    again = list(
+        dict.fromkeys([n for n in ("auto", "newton", "anderson") if n in times] + sorted(close))
+    )
+    begun = perf_counter()
+    runs = 0
     while runs < MAX_RUNS and (runs < 2 or perf_counter() - begun < RUN_TIME):
         if runs == 1 and fastest > 1.0:
             break
         for name in again:
             times[name] = min(times[name], call(problem, name)[0])
         runs += 1
-    best = min((name for name in times if name != "auto"), key=lambda name: times[name], default="auto")
+    best = min(
+        (name for name in times if name != "auto"), key=lambda name: times[name], default="auto"
+    )
     rule = times.get("newton", math.nan)
     if "newton" not in times and "anderson" in times:
         lost = call(problem, "newton")[0] if "newton" in names else 0.0
         rule = lost + times["anderson"]
     return {
-        "auto": times.get("auto", math.nan), "best": times[best], "solver": best, "rule": rule,
-        "stages": [describe_stage(stage) for stage in solution.stages], "status": str(solution.status),
-        "relative": float(solution.residual.relative), "times": times,
-    }  # fmt: skip
+        "auto": times.get("auto", math.nan),
+        "best": times[best],
+        "solver": best,
+        "rule": rule,
+        "stages": [describe_stage(stage) for stage in solution.stages],
+        "status": str(solution.status),
+        "relative": float(solution.residual.relative),
+        "times": times,
+    }
 
 
 def describe_stage(stage: Any) -> str:
@@ -225,29 +252,74 @@ def summarize(label: str, lines: list[dict[str, Any]]) -> list[str]:
         return [label, str(len(lines)), *["-"] * 5, str(len(lines)), *["-"] * 3]
     means = [math.exp(float(np.mean(np.log(x)))) for x in (auto, rule or [math.nan])]
     return [
-        label, str(len(lines)), f"{means[0]:.2f}", f"{np.mean(auto):.2f}", f"{np.quantile(auto, 0.95):.2f}",
-        f"{max(auto):.1f}", str(sum(r > 2.0 for r in auto)), str(len(lines) - len(auto)),
-        f"{means[1]:.2f}", f"{max(rule, default=math.nan):.1f}", str(len(lines) - len(rule)),
-    ]  # fmt: skip
+        label,
+        str(len(lines)),
+        f"{means[0]:.2f}",
+        f"{np.mean(auto):.2f}",
+        f"{np.quantile(auto, 0.95):.2f}",
+        f"{max(auto):.1f}",
+        str(sum(r > 2.0 for r in auto)),
+        str(len(lines) - len(auto)),
+        f"{means[1]:.2f}",
+        f"{max(rule, default=math.nan):.1f}",
+        str(len(lines) - len(rule)),
+    ]
 
 
 def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
     """Print regrets of all problems, of each source and class, and the problems with the largest regret."""
-    head = ["problems", "count", "auto: geometric mean", "mean", "95 %", "worst", "above 2", "unsolved",
-            "rule: geometric mean", "worst", "unsolved"]  # fmt: skip
+    head = [
+        "problems",
+        "count",
+        "auto: geometric mean",
+        "mean",
+        "95 %",
+        "worst",
+        "above 2",
+        "unsolved",
+        "rule: geometric mean",
+        "worst",
+        "unsolved",
+    ]
     cells = [summarize("all", lines)]
     for key in ("source", "class"):
         groups = sorted({x[key] for x in lines})
         cells += [summarize(group, [x for x in lines if x[key] == group]) for group in groups]
     click.echo(markdown(head, cells))
     order = sorted(
-        lines, key=lambda x: -math.inf if x["auto"] != x["auto"] else -compute_regret(x["auto"], x["best"])
+        lines,
+        key=lambda x: (
+            -math.inf if x["auto"] != x["auto"] else -compute_regret(x["auto"], x["best"])
+        ),
     )
-    click.echo("\n" + markdown(
-        ["problem", "rows", "class", "regret", "auto [ms]", "best [ms]", "solver", "stages of auto"],
-        [[f"{x['source']} {x['seed']} {x['name']}", x["m"], x["class"], f"{compute_regret(x['auto'], x['best']):.2f}",
-          f"{1e3 * x['auto']:.3g}", f"{1e3 * x['best']:.3g}", x["solver"], ", ".join(x["stages"]) or x["status"]]
-         for x in order[:worst]]))  # fmt: skip
+    click.echo(
+        "\n"
+        + markdown(
+            [
+                "problem",
+                "rows",
+                "class",
+                "regret",
+                "auto [ms]",
+                "best [ms]",
+                "solver",
+                "stages of auto",
+            ],
+            [
+                [
+                    f"{x['source']} {x['seed']} {x['name']}",
+                    x["m"],
+                    x["class"],
+                    f"{compute_regret(x['auto'], x['best']):.2f}",
+                    f"{1e3 * x['auto']:.3g}",
+                    f"{1e3 * x['best']:.3g}",
+                    x["solver"],
+                    ", ".join(x["stages"]) or x["status"],
+                ]
+                for x in order[:worst]
+            ],
+        )
+    )
 
 
 @click.command("regret")
@@ -260,7 +332,11 @@ def print_tables(lines: list[dict[str, Any]], worst: int) -> None:
     help="Folder with XML files of MuJoCo.",
 )
 @click.option(
-    "--file", "files", multiple=True, type=click.Path(path_type=Path, exists=True), help="Problem in a file."
+    "--file",
+    "files",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Problem in a file.",
 )
 @click.option("--worst", default=20, show_default=True, help="Number of problems that are listed.")
 @click.option(

@@ -45,14 +45,19 @@ PLAN = Path("lavender_ext", "newton", "plan.pxd")
 SIZES = (900, 3_000, 10_000, 30_000, 60_000, 200_000)
 MIN_GROWTH_ROWS = 2_500
 MAX_REPEATED_TIME = 0.5  # [s] Shorter solves run three times, and the smallest time counts.
-MAX_SLOWDOWN, MIN_LIMIT = 3.0, 0.2  # Others may take this multiple of the time of `auto`, or this time [s].
+MAX_SLOWDOWN, MIN_LIMIT = (
+    3.0,
+    0.2,
+)  # Others may take this multiple of the time of `auto`, or this time [s].
 START_TIME = 60.0  # [s] A process may take this much longer than the limit of its solve.
 SICONOS_MAX_ROWS = 8_000  # Larger problems take Siconos longer than any limit of a table.
 SICONOS_SOLVERS = ("siconos NSGS", "siconos ADMM", "siconos NSN_AC")
 Stage = tuple[
     str, str, int
 ]  # solver, law ("coulomb": that of the problem), iterations (0: the solver's default)
-Copy = tuple[str, str, Path, str]  # name in tables, interpreter, folder of a built checkout, contestant
+Copy = tuple[
+    str, str, Path, str
+]  # name in tables, interpreter, folder of a built checkout, contestant
 CONTESTANTS: dict[str, tuple[Stage, ...]] = {
     "auto": (("auto", "coulomb", 0),),
     "newton": (("newton", "coulomb", 0),),
@@ -63,7 +68,7 @@ CONTESTANTS: dict[str, tuple[Stage, ...]] = {
     "newton, relaxed": (("anderson", "cone", 100), ("newton", "cone", 0)),
     "admm, relaxed": (("anderson", "cone", 100), ("admm", "cone", 0)),
     "sweeps then admm": (("anderson", "coulomb", 100), ("admm", "coulomb", 0)),
-}  # fmt: skip
+}
 # Reads {path, stages, tol, limit} as JSON, writes the impulse to PATH.npy and {time, memory, work, stages} to stdout.
 WORKER = """
 import json, resource, sys, time
@@ -105,14 +110,25 @@ def run_worker(
     python: str, folder: Path, path: Path, stages: tuple[Stage, ...], limit: float, tol: float
 ) -> dict[str, Any]:
     """Run stages on a problem's file in a new process; return its measurement, empty if the process failed."""
-    task = {"path": str(path), "stages": stages, "tol": tol, "limit": limit, "repeat": MAX_REPEATED_TIME}
+    task = {
+        "path": str(path),
+        "stages": stages,
+        "tol": tol,
+        "limit": limit,
+        "repeat": MAX_REPEATED_TIME,
+    }
     variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     Path(f"{path}.npy").unlink(missing_ok=True)
     try:
         done = subprocess.run(
-            [python, "-c", WORKER, json.dumps(task)], cwd=folder, env=os.environ | variables, text=True,
-            capture_output=True, timeout=limit + START_TIME, check=True,
-        )  # fmt: skip
+            [python, "-c", WORKER, json.dumps(task)],
+            cwd=folder,
+            env=os.environ | variables,
+            text=True,
+            capture_output=True,
+            timeout=limit + START_TIME,
+            check=True,
+        )
     except subprocess.TimeoutExpired:
         return {}
     except subprocess.CalledProcessError as error:
@@ -155,7 +171,9 @@ def build_without(state: str, folder: Path) -> Copy:
     # The state begins no phase, so that the next state follows.
     without = f"if state == {state}:\n        pass\n    elif state < 0:\n"
     (copy / PLAN).write_text(plan.replace(branch, without), encoding="utf-8")
-    subprocess.run([sys.executable, "setup.py", "-q", "build_ext", "--inplace"], cwd=copy, check=True)
+    subprocess.run(
+        [sys.executable, "setup.py", "-q", "build_ext", "--inplace"], cwd=copy, check=True
+    )
     return f"newton without {state}", sys.executable, copy, "newton"
 
 
@@ -164,13 +182,16 @@ def measure(
 ) -> dict[str, dict[str, Any]]:
     """Return {contestant: {time [s], memory [MiB], residual, solved, work}} on one problem."""
     tasks = [(name, sys.executable, ROOT, CONTESTANTS[name]) for name in names]
-    tasks[1:1] = [(name, python, folder, CONTESTANTS[stages]) for name, python, folder, stages in copies]
+    tasks[1:1] = [
+        (name, python, folder, CONTESTANTS[stages]) for name, python, folder, stages in copies
+    ]
     measured = {}
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "problem.npz"
         problem.save(path)
         for name, python, folder, stages in tasks:
-            auto, allowed = measured.get("auto"), limit
+            auto = measured.get("auto")
+            allowed = limit
             if name in CONTESTANTS and auto is not None and auto["solved"]:
                 allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"]))
             load_per_core = os.getloadavg()[0] / (os.cpu_count() or 1)
@@ -178,15 +199,24 @@ def measure(
             if found:
                 found["residual"] = float(lv.residual(problem, np.load(f"{path}.npy")).relative)
             else:
-                found = {"time": math.nan, "memory": math.nan, "residual": math.inf, "work": {}, "stages": []}
+                found = {
+                    "time": math.nan,
+                    "memory": math.nan,
+                    "residual": math.inf,
+                    "work": {},
+                    "stages": [],
+                }
             measured[name] = found | {"solved": found["residual"] <= tol}
     return measured
 
 
 def compute_regret(line: dict[str, Any]) -> tuple[float, str]:
     """Return the regret of `auto` and the fastest contestant; NaN if `auto` does not solve the problem."""
-    others = {name: found["time"] for name, found in line["runs"].items()
-              if found["solved"] and name in CONTESTANTS and name != "auto"}  # fmt: skip
+    others = {
+        name: found["time"]
+        for name, found in line["runs"].items()
+        if found["solved"] and name in CONTESTANTS and name != "auto"
+    }
     auto = line["runs"]["auto"]
     if not others:
         return (1.0 if auto["solved"] else math.nan), "auto" if auto["solved"] else "-"
@@ -208,40 +238,88 @@ def format_run(found: dict[str, Any] | None) -> str:
 
 def print_tables(lines: list[dict[str, Any]]) -> None:
     """Print each problem, the regret of `auto`, and the growth exponents on structures at rest."""
-    extra = list(dict.fromkeys(name for line in lines for name in line["runs"] if name not in CONTESTANTS))
+    extra = list(
+        dict.fromkeys(name for line in lines for name in line["runs"] if name not in CONTESTANTS)
+    )
     rows = []
     for line in lines:
         auto = line["runs"]["auto"]
         regret, best = compute_regret(line)
-        rows.append([
-            line["structure"], line["sliding"], line["spread"], line["seed"], line["m"], format_run(auto),
-            f"{auto['memory']:.0f}", auto["work"].get("factorisations", 0), best,
-            format_run(line["runs"].get(best)), f"{regret:.2f}",
-            *(format_run(line["runs"].get(name)) for name in extra),
-        ])  # fmt: skip
-    click.echo(markdown(
-        ["structure", "sliding [m/s]", "mass spread", "seed", "rows", "auto [s]", "memory [MiB]", "factorisations",
-         "best", "best [s]", "regret", *(f"{name} [s]" for name in extra)], rows))  # fmt: skip
+        rows.append(
+            [
+                line["structure"],
+                line["sliding"],
+                line["spread"],
+                line["seed"],
+                line["m"],
+                format_run(auto),
+                f"{auto['memory']:.0f}",
+                auto["work"].get("factorisations", 0),
+                best,
+                format_run(line["runs"].get(best)),
+                f"{regret:.2f}",
+                *(format_run(line["runs"].get(name)) for name in extra),
+            ]
+        )
+    click.echo(
+        markdown(
+            [
+                "structure",
+                "sliding [m/s]",
+                "mass spread",
+                "seed",
+                "rows",
+                "auto [s]",
+                "memory [MiB]",
+                "factorisations",
+                "best",
+                "best [s]",
+                "regret",
+                *(f"{name} [s]" for name in extra),
+            ],
+            rows,
+        )
+    )
     compared = [line for line in lines if len(line["runs"].keys() & CONTESTANTS.keys()) > 1]
     for label in ("all", "held out"):
         regrets = [
-            compute_regret(line)[0] for line in compared if label == "all" or line["structure"] in HELD_OUT
+            compute_regret(line)[0]
+            for line in compared
+            if label == "all" or line["structure"] in HELD_OUT
         ]
         solved = [regret for regret in regrets if regret == regret]
         if solved:
-            click.echo(f"\nregret, {label}: median {np.median(solved):.2f}, worst {max(solved):.2f}; "
-                       f"{len(regrets) - len(solved)} of {len(regrets)} problems not solved by auto")  # fmt: skip
+            click.echo(
+                f"\nregret, {label}: median {np.median(solved):.2f}, worst {max(solved):.2f}; "
+                f"{len(regrets) - len(solved)} of {len(regrets)} problems not solved by auto"
+            )
     cells = []
     for name, spread in product(STRUCTURES, sorted({line["spread"] for line in lines})):
-        chosen = [line for line in lines if line["structure"] == name and line["spread"] == spread
-                  and line["sliding"] == 0.0 and line["m"] >= MIN_GROWTH_ROWS]  # fmt: skip
+        chosen = [
+            line
+            for line in lines
+            if line["structure"] == name
+            and line["spread"] == spread
+            and line["sliding"] == 0.0
+            and line["m"] >= MIN_GROWTH_ROWS
+        ]
         points = [
-            (line["m"], line["runs"]["auto"]["time"]) for line in chosen if line["runs"]["auto"]["solved"]
+            (line["m"], line["runs"]["auto"]["time"])
+            for line in chosen
+            if line["runs"]["auto"]["solved"]
         ]
         if points:
             m, times = zip(*points, strict=True)
-            cells.append([name, f"{spread:g}", min(m), max(m), f"{fit_exponent(m, times):.2f}",
-                          len(chosen) - len(points)])  # fmt: skip
+            cells.append(
+                [
+                    name,
+                    f"{spread:g}",
+                    min(m),
+                    max(m),
+                    f"{fit_exponent(m, times):.2f}",
+                    len(chosen) - len(points),
+                ]
+            )
     if cells:
         head = [
             "structure at rest",
@@ -261,8 +339,12 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
-    speeds = sorted({line["sliding"] for line in lines} - {0.0})[-1:]  # The largest speed of the measurements
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained"
+    )
+    speeds = sorted({line["sliding"] for line in lines} - {0.0})[
+        -1:
+    ]  # The largest speed of the measurements
     for axis, speed in zip(axes, (0.0, *speeds), strict=False):
         for k, name in enumerate(STRUCTURES):
             chosen = sorted(
@@ -271,10 +353,14 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
                 if (line["structure"], line["sliding"], line["spread"]) == (name, speed, 0.0)
             )
             for solved, style in ((True, "o-"), (False, "x")):
-                points = [(m, time) for m, time, reached in chosen if reached == solved and time == time]
+                points = [
+                    (m, time) for m, time, reached in chosen if reached == solved and time == time
+                ]
                 if points:
                     label = name if solved or not any(reached for *_, reached in chosen) else None
-                    axis.plot(*zip(*points, strict=True), style, color=f"C{k}", ms=4, lw=1, label=label)
+                    axis.plot(
+                        *zip(*points, strict=True), style, color=f"C{k}", ms=4, lw=1, label=label
+                    )
         axis.set(
             xscale="log",
             yscale="log",
@@ -292,27 +378,50 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
 
 @click.command("scale")
 @click.option(
-    "--structures", default=",".join(STRUCTURES), show_default=True, help="Names, separated by commas."
+    "--structures",
+    default=",".join(STRUCTURES),
+    show_default=True,
+    help="Names, separated by commas.",
 )
 @click.option(
-    "--rows", multiple=True, type=int, help="Approximate number of rows; several times. Default: all sizes."
+    "--rows",
+    multiple=True,
+    type=int,
+    help="Approximate number of rows; several times. Default: all sizes.",
 )
 @click.option(
     "--sliding", multiple=True, type=float, default=(0.0, 0.1, 0.5), show_default=True, help="[m/s]"
 )
 @click.option(
-    "--spread", multiple=True, type=float, default=(0.0, 1.0), show_default=True, help="Spread of log mass."
+    "--spread",
+    multiple=True,
+    type=float,
+    default=(0.0, 1.0),
+    show_default=True,
+    help="Spread of log mass.",
 )
 @click.option("--seed", multiple=True, type=int, default=(7,), show_default=True)
-@click.option("--case", "cases", multiple=True, help="A suite case instead of structures; several times.")
 @click.option(
-    "--solvers", default=",".join(CONTESTANTS), help="Contestants, separated by commas; auto is always run."
+    "--case", "cases", multiple=True, help="A suite case instead of structures; several times."
+)
+@click.option(
+    "--solvers",
+    default=",".join(CONTESTANTS),
+    help="Contestants, separated by commas; auto is always run.",
 )
 @click.option("--limit", default=20.0, show_default=True, help="Time limit of a solve [s].")
-@click.option("--base", "bases", multiple=True, type=click.Path(path_type=Path, exists=True),
-              help="Built checkout with a .venv, whose auto solves the same problems; several times.")  # fmt: skip
 @click.option(
-    "--without", "states", multiple=True, help="State that a copy of Newton's plan leaves out; several times."
+    "--base",
+    "bases",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Built checkout with a .venv, whose auto solves the same problems; several times.",
+)
+@click.option(
+    "--without",
+    "states",
+    multiple=True,
+    help="State that a copy of Newton's plan leaves out; several times.",
 )
 @click.option(
     "--law",
@@ -322,22 +431,45 @@ def draw_figure(lines: list[dict[str, Any]], path: Path) -> None:
     help="Law of friction.",
 )
 @click.option("--tol", default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option("--siconos", envvar="LAVENDER_SICONOS", default="", help="Interpreter that has Siconos.")
-@click.option("--from", "read", multiple=True, type=click.Path(path_type=Path, exists=True),
-              help="Print tables of --out files.")  # fmt: skip
-@click.option("--figure", type=click.Path(path_type=Path), help="Draw time against rows to this file.")
+@click.option(
+    "--siconos", envvar="LAVENDER_SICONOS", default="", help="Interpreter that has Siconos."
+)
+@click.option(
+    "--from",
+    "read",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    help="Print tables of --out files.",
+)
+@click.option(
+    "--figure", type=click.Path(path_type=Path), help="Draw time against rows to this file."
+)
 @out_option("Write every measurement to this JSON file, after each problem.")
 def command(
-    structures: str, rows: tuple[int, ...], sliding: tuple[float, ...], spread: tuple[float, ...],
-    seed: tuple[int, ...], cases: tuple[str, ...], solvers: str, limit: float, bases: tuple[Path, ...],
-    states: tuple[str, ...], law: str, tol: float, siconos: str, read: tuple[Path, ...], figure: Path | None,
+    structures: str,
+    rows: tuple[int, ...],
+    sliding: tuple[float, ...],
+    spread: tuple[float, ...],
+    seed: tuple[int, ...],
+    cases: tuple[str, ...],
+    solvers: str,
+    limit: float,
+    bases: tuple[Path, ...],
+    states: tuple[str, ...],
+    law: str,
+    tol: float,
+    siconos: str,
+    read: tuple[Path, ...],
+    figure: Path | None,
     out: Path | None,
-) -> None:  # fmt: skip
+) -> None:
     """Measure the cost of exact friction against the number of rows."""
     names = ["auto", *(name for name in split_names(solvers, CONTESTANTS) if name != "auto")]
     if siconos:
         check_siconos(siconos)
-    lines: list[dict[str, Any]] = [line for path in read for line in json.loads(path.read_text())["lines"]]
+    lines: list[dict[str, Any]] = [
+        line for path in read for line in json.loads(path.read_text())["lines"]
+    ]
     plan = product(split_names(structures, STRUCTURES), rows or SIZES, sliding, spread, seed)
     problems = (
         ((name, size, speed, deviation, draw), build(name, size, speed, deviation, draw))
@@ -355,11 +487,21 @@ def command(
             runs = measure(problem, names, copies, limit, tol)
             if siconos and problem.m <= SICONOS_MAX_ROWS:
                 runs |= dict(run_siconos(problem, siconos, limit, tol))
-            line = {"structure": name, "rows": size, "m": problem.m, "sliding": speed, "spread": deviation,
-                    "seed": draw, "runs": runs}  # fmt: skip
+            line = {
+                "structure": name,
+                "rows": size,
+                "m": problem.m,
+                "sliding": speed,
+                "spread": deviation,
+                "seed": draw,
+                "runs": runs,
+            }
             lines.append(line)
-            click.echo(f"{given.name} {problem.m} rows: " + ", ".join(
-                f"{key} {format_run(found)}" for key, found in runs.items()), err=True)  # fmt: skip
+            click.echo(
+                f"{given.name} {problem.m} rows: "
+                + ", ".join(f"{key} {format_run(found)}" for key, found in runs.items()),
+                err=True,
+            )
             if out is not None:
                 write_json(out, lines)
     print_tables(lines)
@@ -388,5 +530,7 @@ def split_names(text: str, known: dict[str, Any]) -> list[str]:
             chosen.append(name)
             rest = f",{rest},".replace(f",{name},", ",,").strip(",")
     if rest.strip(","):
-        raise click.BadParameter(f"{rest.strip(',')!r} is not known; the names are {'; '.join(known)}")
+        raise click.BadParameter(
+            f"{rest.strip(',')!r} is not known; the names are {'; '.join(known)}"
+        )
     return [name for name in known if name in chosen]

@@ -83,7 +83,8 @@ def _read(state: State, n: int) -> FloatArray:
 
 
 def _write(state: State, n: int, z: FloatArray) -> None:
-    a, turn = state.a, z[3 * n : 6 * n].reshape(n, 3)
+    a = state.a
+    turn = z[3 * n : 6 * n].reshape(n, 3)
     q = np.column_stack([np.ones(n), 0.5 * turn])
     a["x"][1:] = z[: 3 * n].reshape(n, 3)
     a["q"][1:] = q / np.linalg.norm(q, axis=1)[:, None]
@@ -92,19 +93,29 @@ def _write(state: State, n: int, z: FloatArray) -> None:
     a["cache_impulse"][: 4 * n, :3] = z[12 * n :].reshape(4 * n, 3)
 
 
-def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: float, gain: float) -> State:
+def _at_rest(
+    n: int, sweeps: int, h: float, order: str, friction: float, gap: float, gain: float
+) -> State:
     # feedback of a given gain: a loaded contact without slop has the target -beta gap / h
     slop = 0.0 if gain > 0.0 else 1e-3
     scene = Scene(
-        "stack", n=n, dt=h, substeps=1, order=order, friction=friction, solver_iterations=sweeps, slop=slop,
+        "stack",
+        n=n,
+        dt=h,
+        substeps=1,
+        order=order,
+        friction=friction,
+        solver_iterations=sweeps,
+        slop=slop,
         position_iterations=0,
-    )  # fmt: skip
+    )
     sim = Simulation(scene)
     weight = scene.bodies[1].mass * -scene.parameters.gravity[2] * h
     for last in (False, True):  # the first substep fills the cache
         a = sim.state.a
         a["x"][1:] = [(0.0, 0.0, 0.5 + i + gap * (i + 1)) for i in range(n)]
-        a["q"][1:], a["v"][:] = (1.0, 0.0, 0.0, 0.0), 0.0
+        a["q"][1:] = (1.0, 0.0, 0.0, 0.0)
+        a["v"][:] = 0.0
         if not last:
             sim.step()
     state = sim.state
@@ -142,7 +153,8 @@ def modes(
     gap = PLAY if gain > 0.0 else -5e-4
     state = _at_rest(n, sweeps, h, order, friction, gap, gain)
     substeps = 2 if order == "alternating" else 1
-    rest, work = _read(state, n), state.copy()
+    rest = _read(state, n)
+    work = state.copy()
 
     def after(z: FloatArray) -> FloatArray:
         work.copy_from(state)
@@ -173,7 +185,8 @@ def critical_gain(n: int, sweeps: int, h: float, *, order: str = "given", digits
         return 0.0
     if modes(n, sweeps, h, order=order, gain=1.0).stable:
         return math.inf
-    low, high = math.log(1e-5), 0.0
+    low = math.log(1e-5)
+    high = 0.0
     for _ in range(math.ceil(math.log2(-low * 10.0**digits))):
         middle = 0.5 * (low + high)
         if modes(n, sweeps, h, order=order, gain=math.exp(middle)).stable:
@@ -185,7 +198,9 @@ def critical_gain(n: int, sweeps: int, h: float, *, order: str = "given", digits
 
 def model(kappa: float, gain: float) -> np.ndarray:
     """Return the three eigenvalues of equation (2) (3,) complex."""
-    roots: np.ndarray = 1.0 + np.roots([1.0, kappa * (2.0 + gain), kappa * (1.0 + 2.0 * gain), kappa * gain])
+    roots: np.ndarray = 1.0 + np.roots(
+        [1.0, kappa * (2.0 + gain), kappa * (1.0 + 2.0 * gain), kappa * gain]
+    )
     return roots
 
 
@@ -215,10 +230,15 @@ def figure(path: str | PathLike[str]) -> None:
         most = [np.abs(modes(n, sweeps, h, gain=g).z[0]) for g in gains]
         (line,) = middle.semilogx(gains, most, "o", ms=3, label=f"{n} boxes, {sweeps} sweeps")
         middle.semilogx(
-            gains, [max(1.0, np.abs(model(kappa, g)).max()) for g in gains], color=line.get_color(), lw=0.8
+            gains,
+            [max(1.0, np.abs(model(kappa, g)).max()) for g in gains],
+            color=line.get_color(),
+            lw=0.8,
         )
         middle.axvline(kappa, color=line.get_color(), lw=0.8, ls=":")
-    middle.set(xlabel="g, share of the gap closed in a substep", ylabel="largest |z|", ylim=(0.99, 1.21))
+    middle.set(
+        xlabel="g, share of the gap closed in a substep", ylabel="largest |z|", ylim=(0.99, 1.21)
+    )
     middle.set_title("dots: measured, lines: equation (2), dotted: g = κ", fontsize=10)
     lengths = np.array([1 / 240, 1 / 120, 1 / 60, 1 / 45, 1 / 30])
     for n, sweeps in TALL:
@@ -237,7 +257,8 @@ def numbers() -> Iterator[tuple[str, ...]]:
         for order in ORDERS:
             still = modes(n, sweeps, 1 / 60, order=order)
             whole = modes(n, sweeps, 1 / 60, order=order, gain=1.0)
-            (kappa, hertz), (_, fine) = slowest(still), slowest(modes(n, sweeps, 1 / 240, order=order))
+            (kappa, hertz) = slowest(still)
+            (_, fine) = slowest(modes(n, sweeps, 1 / 240, order=order))
             most, fed = (float(np.abs(m.z[0]) ** (1 / m.substeps)) for m in (still, whole))
             yield (
                 str(n),
@@ -255,10 +276,20 @@ def numbers() -> Iterator[tuple[str, ...]]:
 @click.option("--figure", "picture", type=click.Path(), help="Eigenvalues and growth, drawn.")
 def command(picture: str | None) -> None:
     """Analyse why towers fall with few sweeps: eigenvalues of one substep at rest."""
-    head = ("boxes", "sweeps", "order", "kappa", "Hz, 1/60 s", "Hz, 1/240 s", "|z|, g = 0", "|z|, g = 1")
+    head = (
+        "boxes",
+        "sweeps",
+        "order",
+        "kappa",
+        "Hz, 1/60 s",
+        "Hz, 1/240 s",
+        "|z|, g = 0",
+        "|z|, g = 1",
+    )
     click.echo(markdown(head, numbers()))
     for n, sweeps in TOWERS[1:]:
-        gain, (kappa, _) = critical_gain(n, sweeps, 1 / 60, digits=1), slowest(modes(n, sweeps, 1 / 60))
+        gain = critical_gain(n, sweeps, 1 / 60, digits=1)
+        (kappa, _) = slowest(modes(n, sweeps, 1 / 60))
         click.echo(
             f"{n} boxes, {sweeps} sweeps: the first mode leaves the unit circle at g = {gain:.1e} (kappa {kappa:.1e})"
         )

@@ -119,13 +119,17 @@ class Contestant:
     default: int = 0  # default number of sweeps; LavenderSim's is in the scene
     sweeps: str = "sweeps"  # name of the option for sweeps; empty: solved to a tolerance
     substeps: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the engine; LavenderSim: of the scene
+    options: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # of the engine; LavenderSim: of the scene
 
     def step(self, build: Callable[..., Scene], tower: Tower) -> Stepping:
         """Build the engine with a scene for a tower's step, sweeps, substeps and order."""
         if self.module == "own":
             asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
-            return create_engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
+            return create_engine(
+                "own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options)
+            )
         sweeps = self.default if tower.sweeps is None else tower.sweeps
         options = {"dt": tower.dt, **self.options, **({self.sweeps: sweeps} if self.sweeps else {})}
         options |= {"substeps": tower.substeps or 1} if self.substeps else {}
@@ -153,14 +157,27 @@ ENGINES: dict[str, Contestant] = {
     "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options=_ELLIPTIC),
     "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True),
     "rapier": Contestant(
-        "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations",
+        "rapier",
+        "node",
+        PACKAGES_OF_NODE["rapier"],
+        4,
+        sweeps="iterations",
         options={"engine": "rapier", "sleep": False},
     ),
     "jolt": Contestant(
-        "jolt", "node", PACKAGES_OF_NODE["jolt"], 10,
-        options={"engine": "jolt", "substeps": 1, "gyroscopic": False, "sleep": False, "damping": 0},
+        "jolt",
+        "node",
+        PACKAGES_OF_NODE["jolt"],
+        10,
+        options={
+            "engine": "jolt",
+            "substeps": 1,
+            "gyroscopic": False,
+            "sleep": False,
+            "damping": 0,
+        },
     ),
-}  # fmt: skip
+}
 
 
 def missing(name: str) -> str:
@@ -202,7 +219,11 @@ def measure(engine: str, tower: Tower) -> Line:
 def _watch(made: Standing, tower: Tower) -> Line:
     every = max(1, round(LOOK / tower.dt))
     looks = max(1, round(tower.seconds / (every * tower.dt)))
-    spent, drift, start, stood, steps = 0.0, 0.0, None, tower.seconds, 0
+    spent = 0.0
+    drift = 0.0
+    start = None
+    stood = tower.seconds
+    steps = 0
     first = made.centres()
     for _ in range(looks):
         begin = made.engine.get_cpu_time()
@@ -254,7 +275,12 @@ def lines(
             budgets, substeps if c.substeps else (0,), orders if own else (None,)
         ):
             tower = Tower(
-                boxes=n, dt=1.0 / rate, sweeps=budget, substeps=part or None, order=order, seconds=seconds
+                boxes=n,
+                dt=1.0 / rate,
+                sweeps=budget,
+                substeps=part or None,
+                order=order,
+                seconds=seconds,
             )
             line = measure(name, tower)
             key = (line.engine, line.sweeps, line.substeps)
@@ -266,7 +292,16 @@ def lines(
 def table(found: Sequence[Line]) -> str:
     """Return the results as a markdown table, by tower, step and sweeps per second."""
     head = (
-        *("boxes", "dt [s]", "engine", "sweeps", "substeps", "sweeps a second", "stood [s]", "drift [mm]"),
+        *(
+            "boxes",
+            "dt [s]",
+            "engine",
+            "sweeps",
+            "substeps",
+            "sweeps a second",
+            "stood [s]",
+            "drift [mm]",
+        ),
         "µs a step",
     )
     rows = [
@@ -289,13 +324,19 @@ def table(found: Sequence[Line]) -> str:
 def _at_least(low: int, **lists: Sequence[int]) -> None:
     for name, numbers in lists.items():
         if not numbers or min(numbers) < low:
-            raise InputError(f"--{name}: whole numbers of at least {low} are needed, with commas between")
+            raise InputError(
+                f"--{name}: whole numbers of at least {low} are needed, with commas between"
+            )
 
 
 @click.command("stand")
 @click.option("--engines", type=ListType(str), help="Default: all that are installed.")
 @click.option(
-    "--boxes", type=ListType(int), default="6,10,20", show_default=True, help="Heights of the towers."
+    "--boxes",
+    type=ListType(int),
+    default="6,10,20",
+    show_default=True,
+    help="Heights of the towers.",
 )
 @click.option(
     "--sweeps",
@@ -304,7 +345,9 @@ def _at_least(low: int, **lists: Sequence[int]) -> None:
     show_default=True,
     help="Sweeps of a substep, for whoever takes a number.",
 )
-@click.option("--rates", type=ListType(int), default="60,120", show_default=True, help="Steps a second.")
+@click.option(
+    "--rates", type=ListType(int), default="60,120", show_default=True, help="Steps a second."
+)
 @click.option(
     "--substeps",
     type=ListType(int),
@@ -312,9 +355,15 @@ def _at_least(low: int, **lists: Sequence[int]) -> None:
     show_default=True,
     help="Substeps of a step; 0: the engine's own number.",
 )
-@click.option("--orders", type=ListType(str), help="Sweep orders of LavenderSim; default: that of the scene.")
 @click.option(
-    "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
+    "--orders", type=ListType(str), help="Sweep orders of LavenderSim; default: that of the scene."
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=3.0),
+    default=60.0,
+    show_default=True,
+    help="Simulated at most.",
 )
 @out_option("JSON of the lines.")
 def command(
@@ -341,7 +390,9 @@ def command(
     _at_least(1, boxes=boxes, sweeps=sweeps, rates=rates)
     _at_least(0, substeps=substeps)
     found = []
-    for line in lines(names, boxes, sweeps, rates, substeps, seconds=seconds, orders=orders or (None,)):
+    for line in lines(
+        names, boxes, sweeps, rates, substeps, seconds=seconds, orders=orders or (None,)
+    ):
         found.append(line)
         how = (
             f"stood {line.seconds:g} s, {1e3 * line.drift:.3g} mm"
@@ -355,7 +406,11 @@ def command(
         if out is not None:
             write_json(out, found, engines=_versions(names))
     click.echo(table(found))
-    left = [f"{name} ({missing(name)})" for name in ENGINES if missing(name)] if engines is None else []
+    left = (
+        [f"{name} ({missing(name)})" for name in ENGINES if missing(name)]
+        if engines is None
+        else []
+    )
     if left:
         click.echo(f"\nNot installed: {', '.join(left)}.")
 

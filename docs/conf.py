@@ -11,7 +11,10 @@ from pathlib import Path
 
 from docutils import nodes
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]  # generate.py, benchmarks
+sys.path[:0] = [
+    str(Path(__file__).parent),
+    str(Path(__file__).parent.parent),
+]  # generate.py, benchmarks
 
 import docstrings
 import generate
@@ -89,9 +92,13 @@ def keep_numbers_together(app, doctree, name):
             text.parent, (nodes.literal, nodes.literal_block, nodes.math, nodes.raw, nodes.comment)
         ):
             continue
-        parts, end = [], 0
+        parts = []
+        end = 0
         for match in NUMBER.finditer(text):
-            parts += [nodes.Text(text[end : match.start()]), nodes.inline("", match[0], classes=["number"])]
+            parts += [
+                nodes.Text(text[end : match.start()]),
+                nodes.inline("", match[0], classes=["number"]),
+            ]
             end = match.end()
         if parts:
             text.parent.replace(text, [*parts, nodes.Text(text[end:])])
@@ -99,7 +106,9 @@ def keep_numbers_together(app, doctree, name):
 
 def setup(app):
     """Write the generated pages, and make reStructuredText of docstrings that are plain text."""
-    app.connect("builder-inited", lambda app: generate.write(Path(app.srcdir), Path(app.doctreedir)))
+    app.connect(
+        "builder-inited", lambda app: generate.write(Path(app.srcdir), Path(app.doctreedir))
+    )
     app.connect("source-read", add_contents)
     app.connect("doctree-resolved", keep_numbers_together)
     app.connect("autodoc-process-docstring", docstrings.process, priority=100)

@@ -59,7 +59,9 @@ def draw_cones():
     angle = np.linspace(0, 2 * np.pi, 5)
     for x, title in ((0, "disk"), (2.7, "box"), (5.4, "pyramid")):
         axes.add_patch(Circle((x, 0), 1, fc="#ebf8ff", ec=BLUE))
-        axes.annotate("", (x + 1.35, 0), (x - 1.35, 0), arrowprops={**ARROW, "color": GREY, "lw": 0.8})
+        axes.annotate(
+            "", (x + 1.35, 0), (x - 1.35, 0), arrowprops={**ARROW, "color": GREY, "lw": 0.8}
+        )
         axes.annotate("", (x, 1.35), (x, -1.35), arrowprops={**ARROW, "color": GREY, "lw": 0.8})
         axes.text(x, -1.7, title, ha="center", fontsize=11)
     axes.add_patch(Rectangle((1.7, -1), 2, 2, fc="none", ec=RED, lw=1.6))
@@ -78,8 +80,11 @@ def draw_errors():
     axes.axvspan(1e-17, 2e-15, color="#e2e8f0")
     axes.axvspan(2e-15, 1e-6, color="#f0fff4")
     for x, text, color in (
-        (1, "zero impulse", INK), (3e-4, "your answer", RED), (1e-6, "tol", GREEN), (2e-15, "round-off floor", GREY),
-    ):  # fmt: skip
+        (1, "zero impulse", INK),
+        (3e-4, "your answer", RED),
+        (1e-6, "tol", GREEN),
+        (2e-15, "round-off floor", GREY),
+    ):
         axes.plot([x, x], [-1, 0.75], color=color, lw=2)
         axes.text(x, 0.9, text, color=color, ha="center", fontsize=10)
     axes.text(3e-11, -0.3, "CONVERGED", color=GREEN, ha="center", fontsize=10)
@@ -91,17 +96,26 @@ def draw_auto():
     """Draw the stages of `auto`."""
     figure, axes = make_axes(7.2, 1.9, limits=((-0.2, 15.2), (-1.5, 1.6)))
     boxes = (
-        (0, 0, "problem", "#e2e8f0"), (3, 0.85, "sweeps\n(anderson)", "#ebf8ff"),
-        (3, -0.85, "convex law,\nadmm", "#ebf8ff"), (6.6, 0, "factorisation\n(newton, direct)", "#fffaf0"),
-        (10.0, 0, "both in turn", "#fffaf0"), (12.8, 0, "judge", "#f0fff4"),
-    )  # fmt: skip
+        (0, 0, "problem", "#e2e8f0"),
+        (3, 0.85, "sweeps\n(anderson)", "#ebf8ff"),
+        (3, -0.85, "convex law,\nadmm", "#ebf8ff"),
+        (6.6, 0, "factorisation\n(newton, direct)", "#fffaf0"),
+        (10.0, 0, "both in turn", "#fffaf0"),
+        (12.8, 0, "judge", "#f0fff4"),
+    )
     for x, y, text, color in boxes:
-        axes.add_patch(FancyBboxPatch((x, y - 0.42), 1.9, 0.84, boxstyle="round,pad=0.12", fc=color, ec=INK))
+        axes.add_patch(
+            FancyBboxPatch((x, y - 0.42), 1.9, 0.84, boxstyle="round,pad=0.12", fc=color, ec=INK)
+        )
         axes.text(x + 0.95, y, text, ha="center", va="center", fontsize=8)
     for start, end in (
-        ((1.9, 0.15), (2.86, 0.8)), ((1.9, -0.15), (2.86, -0.8)), ((4.9, 0.8), (6.45, 0.15)),
-        ((4.9, -0.8), (6.45, -0.15)), ((8.5, 0), (9.85, 0)), ((11.9, 0), (12.65, 0)),
-    ):  # fmt: skip
+        ((1.9, 0.15), (2.86, 0.8)),
+        ((1.9, -0.15), (2.86, -0.8)),
+        ((4.9, 0.8), (6.45, 0.15)),
+        ((4.9, -0.8), (6.45, -0.15)),
+        ((8.5, 0), (9.85, 0)),
+        ((11.9, 0), (12.65, 0)),
+    ):
         axes.annotate("", end, start, arrowprops={**ARROW, "color": INK, "lw": 1.1})
     axes.text(2.3, 1.42, "cheap to iterate", fontsize=8, ha="right", color=GREY)
     axes.text(2.3, -1.45, "large, with friction", fontsize=8, ha="right", color=GREY)
@@ -117,7 +131,10 @@ def draw_kink():
     axes.plot([1], [-1], "o", color=RED)
     axes.plot([0.55, 0.55], [-1.3, -0.55], ls=":", color=INK)
     axes.annotate(
-        "", (1, -1.3), (0.55, -1.3), arrowprops={**ARROW, "arrowstyle": "<|-|>", "color": RED, "lw": 1.1}
+        "",
+        (1, -1.3),
+        (0.55, -1.3),
+        arrowprops={**ARROW, "arrowstyle": "<|-|>", "color": RED, "lw": 1.1},
     )
     axes.text(1.08, -1.36, "distance", color=RED, fontsize=10)
     axes.text(-0.4, 0.75, "sticks: slope −1/A", fontsize=10)
@@ -140,7 +157,9 @@ DRAWINGS = {
 
 def main():
     """Write every drawing with the same bytes on every run."""
-    mpl.rcParams.update({"svg.hashsalt": "lavender", "svg.fonttype": "path", "font.family": "DejaVu Sans"})
+    mpl.rcParams.update(
+        {"svg.hashsalt": "lavender", "svg.fonttype": "path", "font.family": "DejaVu Sans"}
+    )
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name, draw in DRAWINGS.items():
         draw().savefig(FOLDER / f"{name}.svg", metadata={"Date": None}, facecolor="white")

@@ -28,7 +28,9 @@ OUT = Path(__file__).resolve().parent / "static" / "web.gif"
 def frames(preset, seconds, pace):
     """PIL images, `FRAMES` a second; `pace` simulated seconds in each."""
     options = {"viewport": {"width": WIDTH, "height": 900}, "color_scheme": "light"}
-    with opened(preset, **options, reduced_motion="reduce") as page:  # nothing moves but by the frame
+    with opened(
+        preset, **options, reduced_motion="reduce"
+    ) as page:  # nothing moves but by the frame
         page.evaluate("lavender.play(false)")
         first = page.locator("#caption").bounding_box()
         last = page.locator(".side canvas").last.bounding_box()
@@ -57,7 +59,9 @@ def write(out, images):
     plain = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     hold = [1000 // FRAMES] * (len(plain) - 1) + [1500]
     data = io.BytesIO()
-    plain[0].save(data, "GIF", save_all=True, append_images=plain[1:], duration=hold, loop=0, optimize=True)
+    plain[0].save(
+        data, "GIF", save_all=True, append_images=plain[1:], duration=hold, loop=0, optimize=True
+    )
     size = len(data.getvalue())
     if size > MOST:
         sys.exit(f"{len(plain)} frames are {size} bytes; {MOST} are allowed: fewer --seconds")
@@ -70,6 +74,8 @@ if __name__ == "__main__":
     parser.add_argument("out", nargs="?", type=Path, default=OUT)
     parser.add_argument("--preset", default="cards")
     parser.add_argument("--seconds", type=float, default=5.0, help="of the film")
-    parser.add_argument("--pace", type=float, default=1.5, help="simulated seconds in a second of the film")
+    parser.add_argument(
+        "--pace", type=float, default=1.5, help="simulated seconds in a second of the film"
+    )
     given = parser.parse_args()
     write(given.out, list(frames(given.preset, given.seconds, given.pace)))

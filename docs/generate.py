@@ -28,7 +28,9 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))  # where examples find `panels`
+sys.path.append(
+    str(Path(__file__).resolve().parent.parent / "examples")
+)  # where examples find `panels`
 
 import docstrings
 from panels import save
@@ -150,7 +152,11 @@ def join_laws(spec):
 
 def built_in():
     """Specs by name, without plug-ins that happen to be installed."""
-    return {name: spec for name, spec in registry.specs().items() if _module_of(spec).startswith("lavender.")}
+    return {
+        name: spec
+        for name, spec in registry.specs().items()
+        if _module_of(spec).startswith("lavender.")
+    }
 
 
 def measure(cache):
@@ -165,7 +171,9 @@ def fingerprint():
     """Of the sources and the compiled kernels: records of other code are not shown as this code's."""
     digest = hashlib.sha256()
     package, kernels = Path(lv.__file__).parent, Path(lavender_ext.__file__).parent
-    for path in sorted([*package.rglob("*.py"), *kernels.rglob("*.px[id]"), *kernels.rglob("*.so")]):
+    for path in sorted(
+        [*package.rglob("*.py"), *kernels.rglob("*.px[id]"), *kernels.rglob("*.so")]
+    ):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -176,7 +184,8 @@ def fingerprint():
 
 def law_figures(report):
     """Law -> SVG text: performance profile over the cases of a law, lines with the solver's name as id."""
-    out, times = {}, report.get_times(report.tolerance)
+    out = {}
+    times = report.get_times(report.tolerance)
     for law in LAWS:
         cases = [case for case in times if report.cases.at[case, "law"] == law]
         own = times.loc[report.accepted[cases].any(axis=1), cases] if cases else times.iloc[:0]
@@ -221,7 +230,11 @@ def abilities(spec):
         "callback": "`callback=`",
         "history": "`history=True`",
     }
-    boxes = f"; boxes under {' and '.join(sorted(spec.box_friction_laws))}" if spec.box_friction_laws else ""
+    boxes = (
+        f"; boxes under {' and '.join(sorted(spec.box_friction_laws))}"
+        if spec.box_friction_laws
+        else ""
+    )
     rows = [
         (
             "laws",
@@ -234,7 +247,10 @@ def abilities(spec):
             if spec.exact
             else "when its convergence test at `tol` is met",
         ),
-        ("runs", "in steps that can be interrupted and continued" if spec.resumable else "in one call"),
+        (
+            "runs",
+            "in steps that can be interrupted and continued" if spec.resumable else "in one call",
+        ),
         (
             "takes",
             "; ".join(text for name, text in yes.items() if getattr(spec, name))
@@ -258,15 +274,19 @@ def _times(ratio):
 def standing(report, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
     times = {tolerance: report.get_times(tolerance) for tolerance in TOLERANCES}
-    best_residuals = tables.tabulate_runs(report).set_index(["solver", "case"])["smallest residual [-]"]
-    rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
+    best_residuals = tables.tabulate_runs(report).set_index(["solver", "case"])[
+        "smallest residual [-]"
+    ]
+    rows = []
+    best = {tolerance: [] for tolerance in TOLERANCES}
     for case in times[TOLERANCES[0]]:
         if (solver, case) not in best_residuals.index:
             continue
         cells = [f"`{case}`"]
         for tolerance in TOLERANCES:
             own = times[tolerance][case]
-            fastest, t = own.drop([solver, "auto"], errors="ignore").min(), own[solver]
+            fastest = own.drop([solver, "auto"], errors="ignore").min()
+            t = own[solver]
             if t != t:
                 cells.append("–")
                 continue
@@ -288,9 +308,7 @@ def standing(report, solver):
         lines[-1] = lines[-1].rstrip(";") + "."
         said = "In the measurements of this build:\n\n" + "\n".join(lines)
     else:
-        said = (
-            "In the measurements of this build another solver was faster on every case, to every tolerance."
-        )
+        said = "In the measurements of this build another solver was faster on every case, to every tolerance."
     head = ("case", *(f"to {format_tolerance(x)}" for x in TOLERANCES), "best residual")
     note = (
         "Times are of the whole call of `lv.solve`; brackets: relative to the fastest *other* solver (`auto` "
@@ -303,7 +321,12 @@ def solver_page(site, spec, report, figures):
     """One page: formula and remarks from the module, abilities and options from the SPEC, curves from the records."""
     module = importlib.import_module(_module_of(spec))
     title = f"# {spec.name}\n\n{spec.summary[:1].upper() + spec.summary[1:]}."
-    parts = [title, docstrings.markdown(module.__doc__ or ""), "## Problems and arguments", abilities(spec)]
+    parts = [
+        title,
+        docstrings.markdown(module.__doc__ or ""),
+        "## Problems and arguments",
+        abilities(spec),
+    ]
     if spec.options:
         rows = [(f"`{name}`", text) for name, text in spec.options.items()]
         parts += ["## Options", table(("option", "meaning"), rows)]
@@ -346,7 +369,12 @@ def solver_overview():
         for s in specs
         if not s.external
     ]
-    own = [(f"`{s.name}`", f"`{n}`", text) for s in specs if not s.external for n, text in s.options.items()]
+    own = [
+        (f"`{s.name}`", f"`{n}`", text)
+        for s in specs
+        if not s.external
+        for n, text in s.options.items()
+    ]
     others = next(s for s in specs if s.external and s.options).options
     takes_order = ", ".join(f"`{s.name}`" for s in specs if s.order)
     return "\n\n".join(
@@ -371,17 +399,37 @@ def tabulate_backends(specs):
     """Return the table of backends: method, version, start, and the programs that a backend does not solve."""
     from lavender.external import backends as b
 
-    programs = "repeated", "dependent", "contradictory", "unbounded", "singular", "convex_on_rows", "saddle"
+    programs = (
+        "repeated",
+        "dependent",
+        "contradictory",
+        "unbounded",
+        "singular",
+        "convex_on_rows",
+        "saddle",
+    )
     solvable = "repeated", "dependent", "singular", "convex_on_rows"
-    behaviours, rows = {x.name: x.behaviour for x in b.BACKENDS}, []
+    behaviours = {x.name: x.behaviour for x in b.BACKENDS}
+    rows = []
     for spec in specs:
-        method, seen = spec.summary.removesuffix(" (QP backend)"), behaviours.get(spec.name)
+        method = spec.summary.removesuffix(" (QP backend)")
+        seen = behaviours.get(spec.name)
         if seen is None:
             rows.append((f"`{spec.name}`", method, "", "", "not observed"))
             continue
         wrong = [n.replace("_", " ") for n in programs if getattr(seen, n) == "wrong"]
-        fails = [n.replace("_", " ") for n in solvable if getattr(seen, n) in ("not found", "raises")]
-        rows.append((f"`{spec.name}` {seen.version}", method, seen.start, ", ".join(wrong), ", ".join(fails)))
+        fails = [
+            n.replace("_", " ") for n in solvable if getattr(seen, n) in ("not found", "raises")
+        ]
+        rows.append(
+            (
+                f"`{spec.name}` {seen.version}",
+                method,
+                seen.start,
+                ", ".join(wrong),
+                ", ".join(fails),
+            )
+        )
     return table(("backend", "method", "start", "wrong", "fails"), rows)
 
 
@@ -420,7 +468,14 @@ def backend_observations():
     seen = [x for x in b.BACKENDS if x.behaviour is not None]
     verdicts = ["version", "triangle", "start", "repeated", "dependent", "contradictory"]
     verdicts += ["unbounded", "singular", "convex_on_rows", "saddle"]
-    numbers = ["linear_term", "small_part", "smallest", "far_bound", "fixed_multiplier", "infeasible_x"]
+    numbers = [
+        "linear_term",
+        "small_part",
+        "smallest",
+        "far_bound",
+        "fixed_multiplier",
+        "infeasible_x",
+    ]
     numbers += ["conflict", "offset"]
     numbers += ["second_solve", "time_limit"]
 
@@ -435,7 +490,9 @@ def backend_observations():
         return table(head, [(name.replace("_", " "), text) for name, text in by_name.items()])
 
     notes = [
-        f"- `{x.name}` {x.behaviour.version}: {text}" for x in seen for text in x.behaviour.notes.values()
+        f"- `{x.name}` {x.behaviour.version}: {text}"
+        for x in seen
+        for text in x.behaviour.notes.values()
     ]
     return [
         "## Solvable and unsolvable programs",
@@ -556,12 +613,16 @@ def by_law(report):
     """Return the table of the three fastest solvers for each law, to each tolerance."""
     rows = []
     for law in dict.fromkeys(report.frame["law"].astype(str)):
-        cases, cells = list(report.cases.index[report.cases["law"] == law]), []
+        cases = list(report.cases.index[report.cases["law"] == law])
+        cells = []
         for tolerance in TOLERANCES:
             ranking = tables.rank_solvers(report, tolerance, cases)
-            first = ranking[(ranking["solved"] == ranking["solved"].max()) & (ranking["solved"] > 0)].head(3)
+            first = ranking[
+                (ranking["solved"] == ranking["solved"].max()) & (ranking["solved"] > 0)
+            ].head(3)
             cells.append(
-                "<br>".join(f"**{name}** {format_seconds(t)}" for name, t in first["mean"].items()) or "none"
+                "<br>".join(f"**{name}** {format_seconds(t)}" for name, t in first["mean"].items())
+                or "none"
             )
         rows.append((LAW_NAMES[law], *cells))
     return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
@@ -636,7 +697,9 @@ def example_page(site, cache):
                 module.main(str(figure))
         first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
         rest = re.sub(r"\n+ +python examples/\S+ .*", "", rest)
-        output = "\n".join(line for line in printed.getvalue().splitlines() if str(figure) not in line)
+        output = "\n".join(
+            line for line in printed.getvalue().splitlines() if str(figure) not in line
+        )
         output = output.replace(str(figure), figure.name)
         parts += [
             f"## {path.stem}",
@@ -686,7 +749,11 @@ def suite_page(site):
         if family.make in seen:
             continue
         seen.add(family.make)
-        others = [f"`{f.name}`" for f in suite.FAMILIES.values() if f.make is family.make and f.name != name]
+        others = [
+            f"`{f.name}`"
+            for f in suite.FAMILIES.values()
+            if f.make is family.make and f.name != name
+        ]
         text = next(t for t in suite.families() if t.partition("(")[0] == name)
         also = f"\n\nAlso as {', '.join(others)}." if others else ""
         parts += [f"### {name}", f"`{text}`", docstrings.markdown(family.make.__doc__ or "") + also]
@@ -745,9 +812,13 @@ def list_public_names():
             yield title, lv, [*first, *(name for name in names if name not in first)]
     for module in API_MODULES:
         held = importlib.import_module(f"lavender.{module}")
-        things = {name: getattr(held, name) for name in sorted(held.__all__) if name not in suite.FAMILIES}
+        things = {
+            name: getattr(held, name) for name in sorted(held.__all__) if name not in suite.FAMILIES
+        }
         names = [
-            name for name, thing in things.items() if callable(thing) and getattr(lv, name, None) is not thing
+            name
+            for name, thing in things.items()
+            if callable(thing) and getattr(lv, name, None) is not thing
         ]
         yield f"lavender.{module}", held, names
 
@@ -762,7 +833,8 @@ def api_pages(site):
             kind, members = "autofunction", ""
             if inspect.isclass(thing):
                 plain = issubclass(thing, (Exception, lv.Status))
-                kind, members = "autoclass", "" if plain else "\n   :members:"
+                kind = "autoclass"
+                members = "" if plain else "\n   :members:"
             parts.append(f"```{{eval-rst}}\n.. {kind}:: {held.__name__}.{name}{members}\n```")
         page = re.sub(r"\W+", "-", title.lower())
         site.write(f"api/{page}.md", "\n\n".join(parts))
@@ -811,7 +883,9 @@ def main():
     parser.add_argument(
         "--pages", action="store_true", help="rewrite the pages of docs/ that are made from tables"
     )
-    parser.add_argument("--tables", action="store_true", help="measure; rewrite tables and figures of pages")
+    parser.add_argument(
+        "--tables", action="store_true", help="measure; rewrite tables and figures of pages"
+    )
     chosen = parser.parse_args()
     here = Path(__file__).resolve().parent
     if chosen.pages:

@@ -24,7 +24,13 @@ from lavender.audit.audit import audit
 
 STATIC = Path(__file__).resolve().parent / "static"
 CASE = "granularF(n=6)"
-SOLVERS = {"auto": "#5b4b9a", "newton": "#2b6cb0", "admm": "#2f855a", "nncg": "#b7791f", "pgs": "#c05621"}
+SOLVERS = {
+    "auto": "#5b4b9a",
+    "newton": "#2b6cb0",
+    "admm": "#2f855a",
+    "nncg": "#b7791f",
+    "pgs": "#c05621",
+}
 TOLERANCES = [10.0**-k for k in range(1, 10)]
 MODEL = "humanoidstandup.xml"
 #: Printed by `lavender tune` for this model, with MuJoCo 4.0.0.
@@ -63,11 +69,17 @@ def measure():
     curves = {name: measure_solver(problem, name) for name in SOLVERS}
     errors = {"your model": measure_model({}), "one line of XML later": measure_model(TUNED)}
     return {
-        "case": CASE, "rows": problem.m, "curves": curves,
-        "model": MODEL, "mujoco": mujoco.__version__, "steps": WORLDS * STEPS,
+        "case": CASE,
+        "rows": problem.m,
+        "curves": curves,
+        "model": MODEL,
+        "mujoco": mujoco.__version__,
+        "steps": WORLDS * STEPS,
         "worst": {name: float(e[-1]) for name, e in errors.items()},
-        "quantiles": {name: np.quantile(e, np.linspace(0, 1, 101)).tolist() for name, e in errors.items()},
-    }  # fmt: skip
+        "quantiles": {
+            name: np.quantile(e, np.linspace(0, 1, 101)).tolist() for name, e in errors.items()
+        },
+    }
 
 
 def draw(numbers):
@@ -78,29 +90,51 @@ def draw(numbers):
         x, y = np.array(numbers["curves"][name]).T
         left.loglog(1e3 * x, y, "o-", color=color, lw=2, ms=4)
         left.annotate(
-            name, (1e3 * x[-1], y[-1]), (6, -3), textcoords="offset points", color=color, fontsize=12
+            name,
+            (1e3 * x[-1], y[-1]),
+            (6, -3),
+            textcoords="offset points",
+            color=color,
+            fontsize=12,
         )
     for limit, text in ((1e-3, "1 mm/s: a game"), (1e-6, "1 µm/s: a reference")):
         left.axhline(limit, color="#718096", lw=0.8, ls="--")
         left.text(
-            0.99, limit, text, color="#4a5568", ha="right", va="bottom", transform=left.get_yaxis_transform()
+            0.99,
+            limit,
+            text,
+            color="#4a5568",
+            ha="right",
+            va="bottom",
+            transform=left.get_yaxis_transform(),
         )
     left.set(xlabel="CPU time [ms]", ylabel="largest velocity error [m/s]")
     left.set_xlim(right=left.get_xlim()[1] * 6)
     left.set_title(f"A pile of {numbers['rows']} rows: error against time", fontsize=12, loc="left")
     share = np.linspace(100, 0, 101)
-    for (name, values), color in zip(numbers["quantiles"].items(), ("#c05621", "#5b4b9a"), strict=True):
+    for (name, values), color in zip(
+        numbers["quantiles"].items(), ("#c05621", "#5b4b9a"), strict=True
+    ):
         values = np.maximum(values, 1e-17)
         right.semilogx(values, share, color=color, lw=2.5)
         right.annotate(
-            name, (values[40], share[40]), (8, 4), textcoords="offset points", color=color, fontsize=12
+            name,
+            (values[40], share[40]),
+            (8, 4),
+            textcoords="offset points",
+            color=color,
+            fontsize=12,
         )
     right.axvline(1e-3, color="#718096", lw=0.8, ls="--")
     right.text(1e-3, 102, "1 mm/s", color="#4a5568", fontsize=10, ha="center")
     right.set(
-        xlabel="velocity error of a step [m/s]", ylabel="steps with a larger error [%]", xlim=(1e-17, 1e-2)
+        xlabel="velocity error of a step [m/s]",
+        ylabel="steps with a larger error [%]",
+        xlim=(1e-17, 1e-2),
     )
-    right.set_title("A humanoid in MuJoCo, before and after tuning", fontsize=12, loc="left", pad=14)
+    right.set_title(
+        "A humanoid in MuJoCo, before and after tuning", fontsize=12, loc="left", pad=14
+    )
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     return figure

@@ -63,9 +63,15 @@ def main() -> None:
             subprocess.run(
                 command, cwd=folder, stdout=subprocess.DEVNULL, check=False
             )  # 1: e.g. too few contacts
-            image = Image.open(io.BytesIO(show(Path(folder) / f"lavender-{name}" / "index.html", size)))
-            image.quantize(COLORS, dither=Image.Dither.NONE).save(STATIC / f"{name}.png", optimize=True)
-        print(f"{STATIC / name}.png: {(STATIC / name).with_suffix('.png').stat().st_size / 1000:.0f} kB")
+            image = Image.open(
+                io.BytesIO(show(Path(folder) / f"lavender-{name}" / "index.html", size))
+            )
+            image.quantize(COLORS, dither=Image.Dither.NONE).save(
+                STATIC / f"{name}.png", optimize=True
+            )
+        print(
+            f"{STATIC / name}.png: {(STATIC / name).with_suffix('.png').stat().st_size / 1000:.0f} kB"
+        )
 
 
 if __name__ == "__main__":

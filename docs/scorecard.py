@@ -34,7 +34,9 @@ mpl.rcParams.update({"font.size": 9})
 
 def markdown(head, lines):
     """Return a table without spaces at the bars."""
-    return "\n".join(f"|{'|'.join(map(str, line))}|" for line in (head, ["---"] * len(head), *lines))
+    return "\n".join(
+        f"|{'|'.join(map(str, line))}|" for line in (head, ["---"] * len(head), *lines)
+    )
 
 
 def find(rows, engine, level, scene):
@@ -48,7 +50,9 @@ def describe(row, scene):
         return "", "white"
     if row.note:
         kind = row.note.split(":")[0]
-        return {"cannot": "–", "too slow": "slow"}.get(kind, kind), NONE if kind == "cannot" else FAILED
+        return {"cannot": "–", "too slow": "slow"}.get(
+            kind, kind
+        ), NONE if kind == "cannot" else FAILED
     error = row.error
     text = (
         "lost"
@@ -72,7 +76,13 @@ def draw_heat(rows):
                 axes.add_patch(mpl.patches.Rectangle((j, i), 1, 1, fc=color, ec="white", lw=1.5))
                 dark = color in (COLORS[0], COLORS[3])
                 axes.text(
-                    j + 0.5, i + 0.52, text, ha="center", va="center", fontsize=8, color="w" if dark else "k"
+                    j + 0.5,
+                    i + 0.52,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="w" if dark else "k",
                 )
         axes.set(xlim=(0, len(SCENES)), ylim=(len(ENGINES), 0))
         axes.set_xticks(
@@ -92,8 +102,11 @@ def draw_heat(rows):
 
 def get_styles(names):
     """Return a colour and a marker for each engine."""
-    colors, markers = mpl.colormaps["tab20"].colors, "osD^v<>Pp*hX"
-    return {name: {"color": colors[i % 20], "marker": markers[i % 12]} for i, name in enumerate(names)}
+    colors = mpl.colormaps["tab20"].colors
+    markers = "osD^v<>Pp*hX"
+    return {
+        name: {"color": colors[i % 20], "marker": markers[i % 12]} for i, name in enumerate(names)
+    }
 
 
 def draw_headings(rows):
@@ -118,7 +131,9 @@ def draw_headings(rows):
                 )
         axes.set(ylim=(0, 0.8), yticks=(0.25, FRICTION, 0.75))
         axes.set_title(f"{level} settings")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8
+    )
     return figure
 
 
@@ -135,7 +150,9 @@ def draw_rates(rows):
         axes.set_xticks(RATES, RATES)
         axes.minorticks_off()
     figure.axes[0].set_ylabel("first rebound [m]")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8
+    )
     return figure
 
 
@@ -146,17 +163,28 @@ def draw_costs(rows):
     for axes, (scene, data) in zip(panels, SCENES.items(), strict=False):
         for name, style in get_styles(ENGINES).items():
             for row in rows.values():
-                if (row.engine, row.scene) == (name, scene) and not row.note and math.isfinite(row.error):
+                if (
+                    (row.engine, row.scene) == (name, scene)
+                    and not row.note
+                    and math.isfinite(row.error)
+                ):
                     face = style["color"] if row.level == "accurate" else "none"
                     axes.loglog(
-                        row.cost, max(row.error, 1e-9), style["marker"], mec=style["color"], mfc=face, ms=5
+                        row.cost,
+                        max(row.error, 1e-9),
+                        style["marker"],
+                        mec=style["color"],
+                        mfc=face,
+                        ms=5,
                     )
         for limit, color in zip(data.limits, COLORS[1:], strict=True):
             axes.axhline(limit, color=color, lw=1)
         axes.set_title(f"{scene} [{data.unit}]", fontsize=9)
         axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
     for name, style in get_styles(ENGINES).items():
-        panels[-1].plot([], [], style["marker"], color=style["color"], ls="", label=ENGINES[name].title)
+        panels[-1].plot(
+            [], [], style["marker"], color=style["color"], ls="", label=ENGINES[name].title
+        )
     for axes in panels[len(SCENES) :]:
         axes.set_axis_off()
     panels[-1].legend(loc="center", fontsize=8, ncols=2, bbox_to_anchor=(0.1, 0.5))

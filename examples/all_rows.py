@@ -53,7 +53,12 @@ def draw_relative(axes, found):
     """Draw the relative residual of all rows."""
     for i, (name, by) in enumerate(found.items()):
         axes.semilogy(np.arange(1, STEPS + 1), by["relative"], f"C{i}", label=name)
-    axes.set(title="all rows, by the judge", xlabel="step", ylabel="relative residual [-]", ylim=(1e-7, 3))
+    axes.set(
+        title="all rows, by the judge",
+        xlabel="step",
+        ylabel="relative residual [-]",
+        ylim=(1e-7, 3),
+    )
     put_legend_right(axes)
 
 
@@ -63,7 +68,10 @@ def draw_normals(axes, found):
         shown = np.where(by["normals"] > 0.0, by["normals"], np.nan)
         axes.semilogy(np.arange(1, STEPS + 1), shown, f"C{i}", label=name)
     axes.set(
-        title="the normals alone, as published", xlabel="step", ylabel="max $|e_n|$ [N s]", ylim=(1e-7, 1)
+        title="the normals alone, as published",
+        xlabel="step",
+        ylabel="max $|e_n|$ [N s]",
+        ylim=(1e-7, 1),
     )
     put_legend_right(axes)
 

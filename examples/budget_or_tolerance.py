@@ -38,7 +38,9 @@ def record_problems():
 
 def solve_steps(steps, **budget):
     """Return sweeps and residual of each step, each started from the impulses of the step before."""
-    before, sweeps, residuals = None, [], []
+    before = None
+    sweeps = []
+    residuals = []
     for problem in steps:
         start = problem.start() if before is None else carry_impulses(*before, problem)
         solution = lv.solve(problem, SOLVER, impulse=start, **budget)

@@ -19,10 +19,8 @@ def read_joints(model):
     """Return the values of each slide (type 2) and hinge (type 3) joint, by its name."""
     joints = {}
     for i in np.flatnonzero(model.jnt_type >= 2):
-        dof, effort = (
-            model.jnt_dofadr[i],
-            model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf,
-        )
+        dof = model.jnt_dofadr[i]
+        effort = model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf
         drives = (
             (model.actuator_trntype == 0)
             & (model.actuator_trnid[:, 0] == i)
@@ -49,7 +47,9 @@ def compare(source, other):
     for key, count in {"equalities (mimic)": "neq", "joints": "njnt"}.items():
         print(f"{key}: {getattr(source, count)}, converted {getattr(other, count)}")
     masses = [model.body_mass.sum() for model in (source, other)]
-    print(f"mass without bodies fixed to the world: {masses[0]:.3f} kg, converted {masses[1]:.3f} kg")
+    print(
+        f"mass without bodies fixed to the world: {masses[0]:.3f} kg, converted {masses[1]:.3f} kg"
+    )
 
 
 def main():

@@ -24,7 +24,8 @@ def make_program(n_steps, seed=1):
     motion = np.eye(N_STATES) + 0.05 * rng.normal(size=(N_STATES, N_STATES))
     motion /= max(1.0, np.abs(np.linalg.eigvals(motion)).max())
     inputs = 0.1 * rng.normal(size=(N_STATES, N_INPUTS))
-    start, weights = rng.normal(size=N_STATES), rng.uniform(0.5, 2.0, N_STATES)
+    start = rng.normal(size=N_STATES)
+    weights = rng.uniform(0.5, 2.0, N_STATES)
     P = sp.diags(np.tile(np.r_[0.1 * np.ones(N_INPUTS), weights], n_steps), format="csc")
     here = sp.hstack([-sp.csc_matrix(inputs), sp.eye(N_STATES)])
     before = sp.hstack([sp.csc_matrix((N_STATES, N_INPUTS)), -sp.csc_matrix(motion)])
@@ -48,7 +49,9 @@ def main():
         if through:
             x = lv.solve_qp(P, q, A=A, b=b, lb=lb, ub=ub, solver=name).x
         else:
-            x = qpsolvers.solve_qp(P, q, A=A, b=b, lb=lb, ub=ub, solver=name, **settings.get(name, {}))
+            x = qpsolvers.solve_qp(
+                P, q, A=A, b=b, lb=lb, ub=ub, solver=name, **settings.get(name, {})
+            )
         seconds = time.process_time() - begin
         reference = x if reference is None else reference
         where = "lavender" if through else "alone"

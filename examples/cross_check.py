@@ -38,7 +38,9 @@ def list_backends(problem):
 def compare(case):
     """Return the table of `cross_check` for a case."""
     problem = suite.case(case).problem
-    return lv.cross_check(problem, [*OURS, *list_backends(problem)], "osqp", tol=TOL, max_iter=100_000)
+    return lv.cross_check(
+        problem, [*OURS, *list_backends(problem)], "osqp", tol=TOL, max_iter=100_000
+    )
 
 
 def numbers():
@@ -60,7 +62,10 @@ def draw_boxed(axes, found):
     axes.semilogx([row.allowed for row in table], place, "k|", markersize=10, label="allowed")
     axes.set_yticks(place, names, fontsize=8)
     axes.invert_yaxis()
-    axes.set(title=f"{table.problem.name}, to {TOL:g}", xlabel=r"distance from OSQP's optimum [$\sqrt{J}$]")
+    axes.set(
+        title=f"{table.problem.name}, to {TOL:g}",
+        xlabel=r"distance from OSQP's optimum [$\sqrt{J}$]",
+    )
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 

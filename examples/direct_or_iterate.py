@@ -72,7 +72,10 @@ def count_multiplications(k):
     a = make_lattice(k)
     n = k * k
     factor = sparse.linalg.splu(
-        a.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        a.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
     )
     below = np.diff(factor.L.indptr) - 1
     sweeps = {}
@@ -132,7 +135,9 @@ def draw_sweeps(axes, found):
             label = f"{SOLVERS[solver]},\ncondition {rounded:,g}"
             axes.loglog(h.iterations[1:], h.relative[1:], style, color=f"C{i}", label=label)
         axes.axhline(row["direct"].residual.relative, color=f"C{i}", linestyle=":", linewidth=0.8)
-    axes.set(title="dotted: direct, one factorisation", xlabel="sweeps", ylabel="relative residual [-]")
+    axes.set(
+        title="dotted: direct, one factorisation", xlabel="sweeps", ylabel="relative residual [-]"
+    )
     put_legend_right(axes)
 
 
@@ -140,7 +145,9 @@ def draw_rows(axes, found):
     """Draw the impulse of every row, direct and after each budget."""
     row = np.arange(1, ROWS + 1)
     axes.bar(row, found["rows"]["exact"], color="0.8", label="direct")
-    for (n, impulse), style in zip(found["rows"]["after"].items(), ("C3x", "C1.", "C0_"), strict=True):
+    for (n, impulse), style in zip(
+        found["rows"]["after"].items(), ("C3x", "C1.", "C0_"), strict=True
+    ):
         axes.plot(row, impulse, style, label=f"{n} sweeps")
     axes.axhline(0.0, color="k", linewidth=0.8)
     title = f"Gauss-Seidel, condition {np.linalg.cond(make_system(SHOWN)[0]):,.0f}"
@@ -152,12 +159,20 @@ def draw_cost(axes, found):
     """Draw the multiplications against the number of rows."""
     n = list(found["cost"])
     for (name, style), color in zip(
-        (("dense", "s-"), ("banded", "o-"), ("sparse", "^-"), ("gauss_seidel", "x--"), ("jacobi", "+--")),
+        (
+            ("dense", "s-"),
+            ("banded", "o-"),
+            ("sparse", "^-"),
+            ("gauss_seidel", "x--"),
+            ("jacobi", "+--"),
+        ),
         ("k", "C2", "C4", "C0", "C1"),
         strict=True,
     ):
         label = f"{SOLVERS[name]} sweeps" if name in SOLVERS else f"{name} factorisation"
-        axes.loglog(n, [found["cost"][i][name] for i in n], style, color=color, markersize=5, label=label)
+        axes.loglog(
+            n, [found["cost"][i][name] for i in n], style, color=color, markersize=5, label=label
+        )
     axes.set(title="a square lattice", xlabel="rows n", ylabel="multiplications")
     put_legend_right(axes)
 
@@ -168,7 +183,9 @@ PANELS = {"sweeps": draw_sweeps, "rows": draw_rows, "cost": draw_cost}
 def print_numbers(found):
     """Print the tables."""
     print(f"{'condition':>10} {'direct':>9} {'Gauss-Seidel':>14} {'Jacobi':>10} {'ratio':>7}")
-    print(f"{'':>10} {'residual':>9} {'sweeps':>14} {'sweeps':>10}   (to a relative residual of {TOL:g})")
+    print(
+        f"{'':>10} {'residual':>9} {'sweeps':>14} {'sweeps':>10}   (to a relative residual of {TOL:g})"
+    )
     for row in found["systems"].values():
         sweeps = [row[s].work["sweeps"] for s in SOLVERS]
         print(

@@ -27,7 +27,9 @@ def plant():
     made, _ = AddMultibodyPlantSceneGraph(builder, time_step=DT)
     made.SetUseSampledOutputPorts(False)  # sampled ports would return the previous step's contacts
     friction = CoulombFriction(0.5, 0.5)
-    made.RegisterCollisionGeometry(made.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+    made.RegisterCollisionGeometry(
+        made.world_body(), RigidTransform(), HalfSpace(), "ground", friction
+    )
     box = made.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(MASS, SIZE, SIZE, SIZE))
     for x in (-0.5, 0.5):
         for y in (-0.5, 0.5):

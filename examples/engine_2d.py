@@ -21,11 +21,17 @@ except ModuleNotFoundError:  # This file was copied without the folder.
     panels = None
 
 # ------------------------------------------------------------------------------------------------------------------
-DT, STEPS, GRAVITY = 1 / 60, 300, np.array([0.0, -9.81, 0.0])  # s, -, m/s^2
-RADIUS, HALF_LENGTH, PIVOT = 0.25, 0.8, np.array([0.0, 1.9])  # m
+DT = 1 / 60  # s
+STEPS = 300
+GRAVITY = np.array([0.0, -9.81, 0.0])  # m/s^2
+RADIUS = 0.25  # m
+HALF_LENGTH = 0.8  # m
+PIVOT = np.array([0.0, 1.9])  # m
 SPEED, MAX_TORQUE, FRICTION = 1.5, 30.0, 0.5  # rad/s, N m, -
 WALLS = (((0.0, 1.0), 0.0), ((1.0, 0.0), -2.0), ((-1.0, 0.0), -2.0))  # inward normal, offset [m]
-MAX_GAP = 0.05  # m: a contact is added at smaller distances, so that nothing is passed within a step
+MAX_GAP = (
+    0.05  # m: a contact is added at smaller distances, so that nothing is passed within a step
+)
 
 
 def find_contacts(position, angle):
@@ -34,9 +40,19 @@ def find_contacts(position, angle):
     for i in range(1, len(position)):
         for side, (wall, offset) in enumerate(WALLS):
             normal = np.array(wall)
-            yield -1, i, position[i] - RADIUS * normal, normal, position[i] @ normal - offset - RADIUS, side
+            yield (
+                -1,
+                i,
+                position[i] - RADIUS * normal,
+                normal,
+                position[i] @ normal - offset - RADIUS,
+                side,
+            )
         nearest = np.clip((position[i] - position[0]) @ along, -HALF_LENGTH, HALF_LENGTH)
-        others = [(0, position[0] + nearest * along, 0.0), *((j, position[j], RADIUS) for j in range(1, i))]
+        others = [
+            (0, position[0] + nearest * along, 0.0),
+            *((j, position[j], RADIUS) for j in range(1, i)),
+        ]
         for j, centre, radius in others:
             distance = np.linalg.norm(position[i] - centre)
             normal = (position[i] - centre) / distance
@@ -49,9 +65,15 @@ def simulate():
     n = len(position)
     inv_mass = np.ones(n)  # 1/kg
     inv_inertia = np.array([3 / HALF_LENGTH**2, *[2 / RADIUS**2] * (n - 1)])  # 1/(kg m^2)
-    angle, velocity, solution, frames, speeds = np.zeros(n), np.zeros((n, 3)), None, [], []
+    angle = np.zeros(n)
+    velocity = np.zeros((n, 3))
+    solution = None
+    frames = []
+    speeds = []
     for _ in range(STEPS):
-        builder = lv.RowBuilder(inv_mass, inv_inertia, velocity + DT * GRAVITY, DT, position, slop=0.002)
+        builder = lv.RowBuilder(
+            inv_mass, inv_inertia, velocity + DT * GRAVITY, DT, position, slop=0.002
+        )
         builder.hinge(-1, 0, PIVOT, anchor_b=position[0])
         builder.motor(-1, 0, speed=SPEED, max_torque=MAX_TORQUE)
         for *contact, gap, feature in find_contacts(position, angle):
@@ -60,7 +82,8 @@ def simulate():
         problem = builder.problem()
         solution = lv.solve(problem, impulse=solution)
         velocity = builder.velocity_after(problem, solution.impulse)
-        position, angle = position + DT * velocity[:, :2], angle + DT * velocity[:, 2]
+        position = position + DT * velocity[:, :2]
+        angle = angle + DT * velocity[:, 2]
         frames.append(position)
         speeds.append(velocity[0, 2])
     return np.array(frames), np.array(speeds), solution.residual.relative
@@ -93,7 +116,9 @@ def draw_paths(axes, found):
     half = HALF_LENGTH * np.array([np.cos(angle), np.sin(angle)])
     axes.plot(*np.stack([PIVOT - half, PIVOT + half], axis=1), "k", linewidth=2, label="bar")
     axes.plot(*PIVOT, "ko", label="hinge")
-    axes.set(title=f"paths of {STEPS} steps, and the end", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.set(
+        title=f"paths of {STEPS} steps, and the end", xlabel="x [m]", ylabel="y [m]", aspect="equal"
+    )
     panels.put_legend_right(axes)
 
 

@@ -114,10 +114,16 @@ def compare_orders():
         few, many = (run(n, order, False) for n in ENDS)
         warm = run(ENDS[0], order, True)
         out[order] = {
-            "tails": [np.median(few[a - 1 : b, 1]) / np.median(many[a - 1 : b, 1]) for a, b in TAILS],
-            "starts": [np.median(few[a - 1 : b, 0]) / np.median(warm[a - 1 : b, 0]) for a, b in STARTS],
+            "tails": [
+                np.median(few[a - 1 : b, 1]) / np.median(many[a - 1 : b, 1]) for a, b in TAILS
+            ],
+            "starts": [
+                np.median(few[a - 1 : b, 0]) / np.median(warm[a - 1 : b, 0]) for a, b in STARTS
+            ],
             "moved": many[-1, 4],
-            "judged": np.array([[judge(n, order, False, window) for n in BUDGETS] for window in TAILS]),
+            "judged": np.array(
+                [[judge(n, order, False, window) for n in BUDGETS] for window in TAILS]
+            ),
         }
     return out
 
@@ -142,7 +148,8 @@ def predict_residual(sweeps):
     """Return max |e_n| [N s] that the dense model predicts for a cold run without friction, swept bottom-up."""
     scene = lv.Scene("stack", friction=0.0)
     problem = lv.Simulation(scene).constraint_problem()
-    a, m = problem.dense(), problem.m
+    a = problem.dense()
+    m = problem.m
     g = np.eye(m) - np.linalg.solve(np.tril(a), a)
     step = scene.parameters.dt / scene.parameters.substeps
     weight = np.repeat(np.arange(6, 0, -1), 4) * 9.81 * step / 4.0
@@ -152,10 +159,14 @@ def predict_residual(sweeps):
 
 def run_without_friction(sweeps):
     """Return max |e_n| [N s] of the run that the dense model describes."""
-    scene = lv.Scene("stack", friction=0.0, warm_start=False, solver_iterations=sweeps, order="bottom_up")
+    scene = lv.Scene(
+        "stack", friction=0.0, warm_start=False, solver_iterations=sweeps, order="bottom_up"
+    )
     sim = lv.Simulation(scene)
     at = lv.SOLVER_FIELDS.index("residual_final")
-    return float(np.median([sim.step()[0]["solver"][at] for _ in range(2 * WINDOW[1])][WINDOW[1] :]))
+    return float(
+        np.median([sim.step()[0]["solver"][at] for _ in range(2 * WINDOW[1])][WINDOW[1] :])
+    )
 
 
 def numbers():
@@ -166,7 +177,9 @@ def numbers():
         },  # (5, 2)
         cold=lambda: {order: summarize(order, False) for order in RUNS},  # (5, 3) each
         warm=lambda: summarize("alternating", True),
-        judged=lambda: {order: np.array([judge(n, order, False) for n in BUDGETS]) for order in RUNS},
+        judged=lambda: {
+            order: np.array([judge(n, order, False) for n in BUDGETS]) for order in RUNS
+        },
         judged_warm=lambda: np.array([judge(n, "alternating", True) for n in BUDGETS]),
         falls=lambda: {
             warm: np.array([time_fall(n, warm) for n in BUDGETS]) for warm in (False, True)
@@ -203,7 +216,8 @@ def draw_published(axes, found):
             )
     set_budget_axis(axes)
     axes.set(
-        title=f"cold, steps {WINDOW[0]} to {WINDOW[1]}", ylabel=f"value / value with {BUDGETS[0]} sweeps [-]"
+        title=f"cold, steps {WINDOW[0]} to {WINDOW[1]}",
+        ylabel=f"value / value with {BUDGETS[0]} sweeps [-]",
     )
     put_legend_right(axes)
 
@@ -217,7 +231,8 @@ def draw_by_budget(axes, found):
         axes.plot(BUDGETS, by, style, markersize=4, label=name)
     set_budget_axis(axes)
     axes.set(
-        title=f"all rows, by the judge, steps {WINDOW[0]} to {WINDOW[1]}", ylabel="relative residual [-]"
+        title=f"all rows, by the judge, steps {WINDOW[0]} to {WINDOW[1]}",
+        ylabel="relative residual [-]",
     )
     put_legend_right(axes)
 
@@ -230,7 +245,10 @@ def draw_stand(axes, found):
     axes.plot(BUDGETS, moved, ".:", color="0.5", label=f"cold: moved\nby {100 * MOVED:g} cm")
     standing = np.isnan(found["falls"][True][:, 2])
     axes.plot(
-        np.array(BUDGETS)[standing], np.full(standing.sum(), LIMIT), "C0^", label="warm: still\nstanding"
+        np.array(BUDGETS)[standing],
+        np.full(standing.sum(), LIMIT),
+        "C0^",
+        label="warm: still\nstanding",
     )
     set_budget_axis(axes)
     axes.set(title=f"six boxes, watched for {LIMIT:.0f} s", ylabel="time [s]")
@@ -273,8 +291,13 @@ def print_numbers(found):
     for order, values in ratios.items():
         moved = 1e3 * found["compared"][order]["moved"]
         print(f"{order + ':':<13}" + "".join(f"{x:>12.0f}" for x in values) + f"{moved:>10.1f}")
-    print(f"{'ratio':<13}" + "".join(f"{b / a:>12.1f}" for a, b in zip(*ratios.values(), strict=True)))
-    print(f"\nrelative residual of all rows, cold, medians{'':>15}" + "".join(f"{n:>9}" for n in BUDGETS))
+    print(
+        f"{'ratio':<13}" + "".join(f"{b / a:>12.1f}" for a, b in zip(*ratios.values(), strict=True))
+    )
+    print(
+        f"\nrelative residual of all rows, cold, medians{'':>15}"
+        + "".join(f"{n:>9}" for n in BUDGETS)
+    )
     one_way, alternating = (found["compared"][order]["judged"] for order in COMPARED)
     for (a, b), *both in zip(TAILS, one_way, alternating, strict=True):
         for name, values in zip((*COMPARED, "gain"), (*both, both[0] / both[1]), strict=True):

@@ -63,7 +63,10 @@ def numbers():
 def measure_switches():
     """Return by how much the residual at the start rises if warm starts end after each step of SWITCHES [-]."""
     warm = get_column(run(True)[0], "residual_initial")
-    return [get_column(run(True, n, steps=n + 1)[0], "residual_initial")[n] / warm[n - 1] for n in SWITCHES]
+    return [
+        get_column(run(True, n, steps=n + 1)[0], "residual_initial")[n] / warm[n - 1]
+        for n in SWITCHES
+    ]
 
 
 def get_column(solver, name):
@@ -97,7 +100,10 @@ def draw_matches(axes, found):
     """Draw the number of contacts that were found in the cache."""
     draw_over_steps(axes, found, "cache_matches")
     axes.set(
-        title="contacts found in the cache, of 24", ylabel="matches", ylim=(-1, 26), yticks=(0, 8, 16, 24)
+        title="contacts found in the cache, of 24",
+        ylabel="matches",
+        ylim=(-1, 26),
+        yticks=(0, 8, 16, 24),
     )
 
 
@@ -117,7 +123,8 @@ def print_numbers(found):
             print(
                 f"{name:<20}{f'{first}-{last}':>9}{matches:>9}"
                 + "".join(
-                    f"{x:>12.2e}" for x in (*values, np.median(found["judged"][name][first - 1 : last]))
+                    f"{x:>12.2e}"
+                    for x in (*values, np.median(found["judged"][name][first - 1 : last]))
                 )
             )
     initial = {
@@ -131,7 +138,8 @@ def print_numbers(found):
     )
     solver = found["values"]["switched off"]
     starts, matches = (
-        get_column(solver, k)[SWITCH - 1 : SWITCH + 1] for k in ("residual_initial", "cache_matches")
+        get_column(solver, k)[SWITCH - 1 : SWITCH + 1]
+        for k in ("residual_initial", "cache_matches")
     )
     print(
         f"at the switch the start goes from {starts[0]:.1e} to {starts[1]:.1e} N s, {starts[1] / starts[0]:.0f} times, "

@@ -32,7 +32,8 @@ TOL = 1e-10
 def make_problem():
     """Return normal and tangent of each contact, one after the other: A (12, 12) [1/kg], b (12,) [m/s]."""
     jacobian = np.eye(N) - np.eye(N, k=-1)
-    down, sideways = np.full(N, -GRAVITY_STEP), np.zeros(N)
+    down = np.full(N, -GRAVITY_STEP)
+    sideways = np.zeros(N)
     sideways[-1] = PUSH
     a = np.kron(jacobian @ jacobian.T, np.eye(2))  # rows of a contact: normal, tangent
     b = -np.stack([jacobian @ down, jacobian @ sideways], axis=1).ravel()
@@ -76,7 +77,9 @@ STYLES = {"no friction": "o:", "huge bounds": "s--", "bounds from normals": "D-"
 def get_impulses(found):
     """Return the impulses (12,) [N s] by the names of STYLES."""
     rounds = found["rounds"]
-    return dict(zip(STYLES, (rounds[0], found["glued"], rounds[-1], found["coulomb"].impulse), strict=True))
+    return dict(
+        zip(STYLES, (rounds[0], found["glued"], rounds[-1], found["coulomb"].impulse), strict=True)
+    )
 
 
 def draw_friction(axes, found):

@@ -36,7 +36,9 @@ def make_two_rows():
 
 def make_scene_problem():
     """Return the first problem of the gallery's scene: eight contacts with friction."""
-    return lv.Simulation(lv.Scene("heavy_on_light", ratio=RATIO, warm_start=False)).constraint_problem()
+    return lv.Simulation(
+        lv.Scene("heavy_on_light", ratio=RATIO, warm_start=False)
+    ).constraint_problem()
 
 
 def measure_history(problem):
@@ -79,7 +81,9 @@ def print_numbers(found):
     most = {name: left.max() for name, left in found.items()}
     print(f"with four corners and friction it rises to {most['four corners and friction']:.2f}")
     late = found["four corners and friction"]
-    print(f"its mean factor per sweep from 64 to 256 sweeps: {(late[256] / late[64]) ** (1.0 / 192.0):.4f}")
+    print(
+        f"its mean factor per sweep from 64 to 256 sweeps: {(late[256] / late[64]) ** (1.0 / 192.0):.4f}"
+    )
 
 
 def main(path="heavy_on_light.png"):

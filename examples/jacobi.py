@@ -38,7 +38,12 @@ METHODS = {
     "Jacobi, undamped": ("jacobi", {"omega": 1.0}),
     "Jacobi, safe damping": ("jacobi", {}),
 }
-STAGES = {"Gauss-Seidel": N, "Gauss-Seidel, coloured": 2, "Jacobi, undamped": 1, "Jacobi, safe damping": 1}
+STAGES = {
+    "Gauss-Seidel": N,
+    "Gauss-Seidel, coloured": 2,
+    "Jacobi, undamped": 1,
+    "Jacobi, safe damping": 1,
+}
 SHUFFLES = 20
 BUDGET = 50  # sweeps of the comparison of orders
 
@@ -56,7 +61,8 @@ def make_repeated(k=3):
 
 def compare_orders():
     """Return how many different impulses (in bits) shuffled orders give: within the colours, and of all rows."""
-    stack, rng = make_stack(), np.random.default_rng(0)
+    stack = make_stack()
+    rng = np.random.default_rng(0)
     color = compute_block_colors(stack)
 
     def sweep(order):
@@ -80,14 +86,18 @@ def find_first_sweep(name, problem, converged):
     return 1 + bisect_left(
         range(1, converged + 1),
         True,
-        key=lambda n: lv.solve(problem, solver, tol=0.0, max_iter=n, **options).residual.relative <= TOL,
+        key=lambda n: (
+            lv.solve(problem, solver, tol=0.0, max_iter=n, **options).residual.relative <= TOL
+        ),
     )
 
 
 def numbers():
     """Return the solutions of the stack and of the repeated contact, and the comparison of orders."""
     return Numbers(
-        stack=lambda: {name: solve_by(name, make_stack(), MAX_SWEEPS, history=True) for name in METHODS},
+        stack=lambda: {
+            name: solve_by(name, make_stack(), MAX_SWEEPS, history=True) for name in METHODS
+        },
         repeated=lambda: {name: solve_by(name, make_repeated(), 1000) for name in METHODS},
         orders=compare_orders,
     )

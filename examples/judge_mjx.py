@@ -26,10 +26,18 @@ def judge(model, datas):
     d = jax.jit(jax.vmap(lambda d: mjx.forward(m, d)))(d)
     e = d._impl
     batch, impulse = lv.io.from_efc(
-        efc_J=e.efc_J, efc_D=e.efc_D, efc_aref=e.efc_aref, efc_type=e.efc_type, efc_frictionloss=e.efc_frictionloss,
-        efc_force=e.efc_force, M=e.M, qvel=d.qvel, qacc_smooth=d.qacc_smooth, qfrc_smooth=d.qfrc_smooth,
+        efc_J=e.efc_J,
+        efc_D=e.efc_D,
+        efc_aref=e.efc_aref,
+        efc_type=e.efc_type,
+        efc_frictionloss=e.efc_frictionloss,
+        efc_force=e.efc_force,
+        M=e.M,
+        qvel=d.qvel,
+        qacc_smooth=d.qacc_smooth,
+        qfrc_smooth=d.qfrc_smooth,
         timestep=m.opt.timestep,
-    )  # fmt: skip
+    )
     return lv.residual_many(batch, impulse)
 
 
@@ -37,7 +45,11 @@ def main():
     """Judge 64 worlds of a model with random velocities."""
     if len(sys.argv) != 2:
         sys.exit("usage: python examples/judge_mjx.py MODEL.xml")
-    for name, package in (("mujoco", "mujoco"), ("jax", "mujoco-mjx"), ("mujoco.mjx", "mujoco-mjx")):
+    for name, package in (
+        ("mujoco", "mujoco"),
+        ("jax", "mujoco-mjx"),
+        ("mujoco.mjx", "mujoco-mjx"),
+    ):
         if importlib.util.find_spec(name) is None:
             sys.exit(f"{name} is not installed: pip install {package}")
     import mujoco
@@ -47,7 +59,9 @@ def main():
     for i, data in enumerate(datas):
         data.qvel[:] = 0.1 * np.random.default_rng(i).standard_normal(model.nv)
     found = judge(model, datas)
-    print(f"largest velocity error {found.velocity_error.max():.2g} m/s, {sorted(set(found.verdict))}")
+    print(
+        f"largest velocity error {found.velocity_error.max():.2g} m/s, {sorted(set(found.verdict))}"
+    )
 
 
 if __name__ == "__main__":

@@ -24,13 +24,24 @@ def judge(model, datas):
     e, c = d.efc, d.contact
     batch, impulse = lv.io.from_efc(
         efc_J=e.J.numpy()[:, :, : model.nv],  # its columns are padded
-        efc_D=e.D.numpy(), efc_aref=e.aref.numpy(), efc_type=e.type.numpy(), efc_frictionloss=e.frictionloss.numpy(),
-        efc_force=e.force.numpy(), nefc=d.nefc.numpy(),
+        efc_D=e.D.numpy(),
+        efc_aref=e.aref.numpy(),
+        efc_type=e.type.numpy(),
+        efc_frictionloss=e.frictionloss.numpy(),
+        efc_force=e.force.numpy(),
+        nefc=d.nefc.numpy(),
         M=(d.M.numpy(), model.M_colind, np.append(model.M_rowadr, len(model.M_colind))),
-        qvel=d.qvel.numpy(), qacc_smooth=d.qacc_smooth.numpy(), qfrc_smooth=d.qfrc_smooth.numpy(),
+        qvel=d.qvel.numpy(),
+        qacc_smooth=d.qacc_smooth.numpy(),
+        qfrc_smooth=d.qfrc_smooth.numpy(),
         timestep=model.opt.timestep,
-        contacts=(c.worldid.numpy(), c.efc_address.numpy()[:, 0], c.dim.numpy(), c.friction.numpy()),
-    )  # fmt: skip
+        contacts=(
+            c.worldid.numpy(),
+            c.efc_address.numpy()[:, 0],
+            c.dim.numpy(),
+            c.friction.numpy(),
+        ),
+    )
     return lv.residual_many(batch, impulse)
 
 
@@ -48,7 +59,9 @@ def main():
     for i, data in enumerate(datas):
         data.qvel[:] = 0.1 * np.random.default_rng(i).standard_normal(model.nv)
     found = judge(model, datas)
-    print(f"largest velocity error {found.velocity_error.max():.2g} m/s, {sorted(set(found.verdict))}")
+    print(
+        f"largest velocity error {found.velocity_error.max():.2g} m/s, {sorted(set(found.verdict))}"
+    )
 
 
 if __name__ == "__main__":

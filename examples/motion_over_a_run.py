@@ -82,7 +82,12 @@ def figure(found, path):
         left.semilogy(np.maximum(run["motion"], 1e-16), "C1" + style, label=f"motion error, {name}")
         middle.semilogy(1e3 * np.maximum(run["drift"], 1e-16), "C2" + style, label=name)
     left.set(xlabel="step", ylabel="relative [-]", title="16 sweeps, bottom up", ylim=(1e-13, 3))
-    middle.set(xlabel="step", ylabel="drift [mm]", title="from the run solved to the floor", ylim=(1e-2, 1e3))
+    middle.set(
+        xlabel="step",
+        ylabel="drift [mm]",
+        title="from the run solved to the floor",
+        ylim=(1e-2, 1e3),
+    )
     for name, mark in (("residual", "o"), ("motion", "^")):
         x = [run[name][1:].mean() for run in found]
         right.loglog(x, [1e3 * run["drift"][-1] for run in found], mark, label=f"mean {name}")
@@ -98,13 +103,23 @@ def figure(found, path):
 
 
 def _run(found, sweeps, warm):
-    return next(r for r in found if (r["sweeps"], r["order"], r["warm"]) == (sweeps, "bottom_up", warm))
+    return next(
+        r for r in found if (r["sweeps"], r["order"], r["warm"]) == (sweeps, "bottom_up", warm)
+    )
 
 
 def main(path="motion_over_a_run.png"):
     """Print a line per run and the rank correlations, and save the figure."""
     found = numbers()
-    head = ("sweeps", "order", "start", "residual", "motion error", "speed error", "drift at the end")
+    head = (
+        "sweeps",
+        "order",
+        "start",
+        "residual",
+        "motion error",
+        "speed error",
+        "drift at the end",
+    )
     print("".join(f"{word:>18}" for word in head))
     for run in found:
         means = (run["residual"][1:].mean(), run["motion"][1:].mean())

@@ -73,7 +73,9 @@ def make_cases():
 
 def measure_error(problem, impulse=None, sweeps=BUDGET, solver="pgs", **order):
     """Return the relative residual after so many sweeps, from `impulse` or from zero."""
-    return lv.solve(problem, solver, tol=0.0, max_iter=sweeps, impulse=impulse, **order).residual.relative
+    return lv.solve(
+        problem, solver, tol=0.0, max_iter=sweeps, impulse=impulse, **order
+    ).residual.relative
 
 
 def measure_slowest_factors():
@@ -95,7 +97,8 @@ def measure_slowest_factors():
 
 def measure_all(problem, order):
     """Return the error after BUDGET sweeps over that of zero impulses, by measure [-]."""
-    a, exact = problem.dense(), lv.solve(problem, "direct", tol=1e-12).impulse
+    a = problem.dense()
+    exact = lv.solve(problem, "direct", tol=1e-12).impulse
     swept = lv.solve(problem, "pgs", tol=0.0, max_iter=BUDGET, order=order).impulse
 
     def measure(impulse):
@@ -151,7 +154,10 @@ def measure_histories(problem):
     }
     out["Jacobi"] = [measure_error(problem, sweeps=n, solver="jacobi") for n in SWEEPS]
     out["random"] = np.array(
-        [[measure_error(problem, sweeps=n, order="random", seed=seed) for n in SWEEPS] for seed in SEEDS]
+        [
+            [measure_error(problem, sweeps=n, order="random", seed=seed) for n in SWEEPS]
+            for seed in SEEDS
+        ]
     )
     return out
 
@@ -179,7 +185,10 @@ def measure_starts():
         },
         "slow": {name: measure_slow_part(changed, start, exact) for name, start in starts.items()},
         "cold and reversed": np.array(
-            [[measure_error(changed, starts[k], n) for n in range(16)] for k in ("cold", "in reverse")]
+            [
+                [measure_error(changed, starts[k], n) for n in range(16)]
+                for k in ("cold", "in reverse")
+            ]
         ),
     }
 
@@ -189,7 +198,9 @@ def numbers():
     return Numbers(
         orders=measure_orders,
         factors=measure_slowest_factors,
-        measures=lambda: {name: compare_measures(problem) for name, problem in make_cases().items()},
+        measures=lambda: {
+            name: compare_measures(problem) for name, problem in make_cases().items()
+        },
         lighter=lambda: measure_histories(make_cases()["falling, lighter above"]),
         starts=measure_starts,
     )
@@ -248,7 +259,9 @@ def print_numbers(found):
     )
     print()
     for name, by in found["factors"].items():
-        print(f"{name:<23} a sweep shrinks the slowest part by {min(by):.3f} to {max(by):.3f}, by the order")
+        print(
+            f"{name:<23} a sweep shrinks the slowest part by {min(by):.3f} to {max(by):.3f}, by the order"
+        )
     print("\nerror of top down over that of bottom up, by measure")
     for name, by in found["measures"].items():
         print(f"{name:<23}" + "".join(f"   {measure} {ratio:.2f}" for measure, ratio in by.items()))

@@ -32,26 +32,38 @@ def run(steps=STEPS):
 
     made, box, corners = model()
     data = made.createData()
-    q, v = pin.neutral(made), np.zeros(made.nv)
+    q = pin.neutral(made)
+    v = np.zeros(made.nv)
     q[2] = 0.25
     q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, 0.2, 0.0)).coeffs()
-    heights, speeds, previous, worst = [], [], None, 0.0
+    heights = []
+    speeds = []
+    previous = None
+    worst = 0.0
     for _ in range(steps):
         pin.forwardKinematics(made, data, q)
         models = []
         for corner in corners:
             place = data.oMi[box].act(corner)
-            place[2] = 0.0  # the ground point below; z of a contact points from the ground to the box
+            place[2] = (
+                0.0  # the ground point below; z of a contact points from the ground to the box
+            )
             models.append(
                 pin.PointContactConstraintModel(
-                    made, 0, pin.SE3(np.eye(3), place), box, pin.SE3(data.oMi[box].rotation.T, corner)
+                    made,
+                    0,
+                    pin.SE3(np.eye(3), place),
+                    box,
+                    pin.SE3(data.oMi[box].rotation.T, corner),
                 )
             )
             models[-1].setFriction(0.5)
         problem = lv.io.from_pinocchio(
             made, data, models, [m.createData() for m in models], DT, q=q, v=v, correction=0.1
         )
-        previous = lv.solve(problem, impulse=previous, tol=1e-8)  # the contacts are the same in every step
+        previous = lv.solve(
+            problem, impulse=previous, tol=1e-8
+        )  # the contacts are the same in every step
         worst = max(worst, previous.residual.relative)
         v = problem.velocity(previous.impulse)
         q = pin.integrate(made, q, DT * v)
@@ -63,8 +75,12 @@ def run(steps=STEPS):
 
 def main():
     heights, speeds, force, worst = run()
-    print(f"rests at {1e3 * heights[-1]:.2f} mm with {speeds[-1]:.1e} m/s; the ground carries {force:.2f} N")
-    print(f"weight {9.81 * MASS:.2f} N; worst relative residual of {len(heights)} steps {worst:.1e}")
+    print(
+        f"rests at {1e3 * heights[-1]:.2f} mm with {speeds[-1]:.1e} m/s; the ground carries {force:.2f} N"
+    )
+    print(
+        f"weight {9.81 * MASS:.2f} N; worst relative residual of {len(heights)} steps {worst:.1e}"
+    )
 
 
 if __name__ == "__main__":

@@ -26,11 +26,16 @@ JAC = np.array([[0.0, 1.0], [1.0, 0.0]])  # normal, tangent of a box that moves 
 
 def run(pushes):
     """Return the final position [m], the speeds, and problem and solution of each step; pushes (PUSHED,) [N s]."""
-    v, x, speeds, taken = np.zeros(2), 0.0, [], []
+    v = np.zeros(2)
+    x = 0.0
+    speeds = []
+    taken = []
     for k in range(STEPS):
         u = pushes[k] if k < PUSHED else 0.0
         free = v + np.array([u / MASS, -DT * GRAVITY])
-        problem = lv.Problem.from_jacobian(JAC, MASS * np.eye(2), free, cones=lv.Cones.contacts(MU, 1))
+        problem = lv.Problem.from_jacobian(
+            JAC, MASS * np.eye(2), free, cones=lv.Cones.contacts(MU, 1)
+        )
         solution = lv.solve(problem, tol=1e-12)
         v = problem.velocity(solution.impulse)
         x += DT * v[0]
@@ -41,7 +46,10 @@ def run(pushes):
 
 def gradient(taken):
     """Return d x / d pushes (PUSHED,) [m/(N s)], and the additional impulse [N s] to each step's next switch."""
-    back, by_push, lacks, switching = np.zeros(2), np.zeros(PUSHED), np.zeros(PUSHED), 0
+    back = np.zeros(2)
+    by_push = np.zeros(PUSHED)
+    lacks = np.zeros(PUSHED)
+    switching = 0
     for k in reversed(range(STEPS)):
         d = lv.derivative(*taken[k])
         back = back + np.array([DT, 0.0])  # the speed of this step contributes to x
@@ -56,13 +64,18 @@ def gradient(taken):
 def descent(heeds):
     """Return the pushes and the error [m] of each iteration."""
     u = np.full(PUSHED, WEAK * MU * MASS * GRAVITY * DT)
-    errors, crossed = [], 0
+    errors = []
+    crossed = 0
     x, _, taken = run(u)
     for _ in range(ITERATIONS):
         errors.append(abs(x - GOAL))
         by_push, lacks, _ = gradient(taken)
         slope = float(by_push @ by_push)
-        tried = [u + (GOAL - x) / slope * by_push * part for part in (1.0, 0.3, 0.1)] if slope > 0.0 else []
+        tried = (
+            [u + (GOAL - x) / slope * by_push * part for part in (1.0, 0.3, 0.1)]
+            if slope > 0.0
+            else []
+        )
         if heeds and lacks.any():
             tried.append(u + 1.01 * lacks + 1e-6 * (lacks > 0.0))
         for i, other in enumerate(tried):

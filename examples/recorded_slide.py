@@ -40,7 +40,9 @@ def step(v, k, mass, mu):
 
 def slide(mass, mu):
     """Return the speeds along x (STEPS + 1,), and problem and solution of each step."""
-    v, speeds, taken = np.zeros(3), [0.0], []
+    v = np.zeros(3)
+    speeds = [0.0]
+    taken = []
     for k in range(STEPS):
         problem, solution = step(v, k, mass, mu)
         v = problem.velocity(solution.impulse)
@@ -53,7 +55,10 @@ def loss(recorded, mass, mu):
     """Return half the mean square error of the speeds [m2/s2], its gradient by (mass, mu), and the contact's states."""
     speeds, taken = slide(mass, mu)
     error = (speeds - recorded) / STEPS
-    back, by_mass, by_mu, states = np.zeros(3), 0.0, 0.0, []
+    back = np.zeros(3)
+    by_mass = 0.0
+    by_mu = 0.0
+    states = []
     for k in reversed(range(STEPS)):
         problem, solution = taken[k]
         back = back + np.array([error[k + 1], 0.0, 0.0])
@@ -70,7 +75,9 @@ def numbers():
     """Return (mass, mu, loss) of each iteration of the descent, and the recording."""
     exact, _ = slide(**TRUE)
     recorded = exact + NOISE * np.random.default_rng(0).standard_normal(len(exact))
-    x, before, way = np.log([START["mass"], START["mu"]]), None, []
+    x = np.log([START["mass"], START["mu"]])
+    before = None
+    way = []
     for _ in range(ITERATIONS):
         mass, mu = np.exp(x)
         value, gradient, states = loss(recorded, mass, mu)

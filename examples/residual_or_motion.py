@@ -27,7 +27,9 @@ def light_beside_heavy():
     mass = np.array([1000.0, 1000.0, 1000.0, 1e-3])
     jac = np.array([[1.0, 0, 0, 0], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, 0, 1]])
     b = np.array([0.16, 0.0, 0.0, 0.16])
-    problem = lv.Problem.lcp(jac @ np.diag(1.0 / mass) @ jac.T, b, name="a gram beside three tonnes")
+    problem = lv.Problem.lcp(
+        jac @ np.diag(1.0 / mass) @ jac.T, b, name="a gram beside three tonnes"
+    )
     return problem, lv.solve(problem, "direct").impulse * [1, 1, 1, 0]
 
 
@@ -47,7 +49,8 @@ def numbers():
     error = lv.motion_error(problem, impulse)
     return {
         "curves": {
-            name: curve(name) for name in (*(f"stack(n={n})" for n in HEIGHTS), "hang(n=33, tip_mass=1e4)")
+            name: curve(name)
+            for name in (*(f"stack(n={n})" for n in HEIGHTS), "hang(n=33, tip_mass=1e4)")
         },
         "gram": (lv.residual(problem, impulse), error),
     }
@@ -65,7 +68,12 @@ def figure(found, path):
     ax.loglog(residual.relative, error.relative, "k*", ms=10, label="a gram beside three tonnes")
     ends = np.array([1e-5, 1.0])
     ax.loglog(ends, ends, "k-", lw=0.8)
-    ax.set(xlabel="relative residual [-]", ylabel="relative motion error [-]", xlim=(1e-5, 2), ylim=(1e-5, 2))
+    ax.set(
+        xlabel="relative residual [-]",
+        ylabel="relative motion error [-]",
+        xlim=(1e-5, 2),
+        ylim=(1e-5, 2),
+    )
     ax.legend(fontsize=9)
     canvas.savefig(path, dpi=150)
 
@@ -79,7 +87,9 @@ def main(path="residual_or_motion.png"):
             below = np.flatnonzero(values[:, 1] <= level)
             if len(below) or level == 1e-1:
                 sweeps, residual, motion = values[below[0] if len(below) else -1]
-                print(f"{name:<28}{sweeps:>8.0f}{residual:>12.1e}{motion:>14.1e}{motion / residual:>9.1f}")
+                print(
+                    f"{name:<28}{sweeps:>8.0f}{residual:>12.1e}{motion:>14.1e}{motion / residual:>9.1f}"
+                )
     residual, error = found["gram"]
     factor = error.relative / residual.relative
     print(

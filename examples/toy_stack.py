@@ -73,10 +73,12 @@ def sweep_by_hand(a, b, sweeps):
 def clamp_after_each_sweep(toy):
     """Sweep without bounds and clamp at the end of each sweep: impulse (8,), lowest impulse within a sweep, [N s]."""
     free = lv.Problem.linear(toy.dense(), toy.b)
-    impulse, lowest = np.zeros(N), 0.0
+    impulse = np.zeros(N)
+    lowest = 0.0
     for _ in range(SWEEPS):
         swept = lv.solve(free, "gauss_seidel", impulse=impulse, tol=0.0, max_iter=1).impulse
-        impulse, lowest = np.maximum(swept, 0.0), min(lowest, swept.min())
+        impulse = np.maximum(swept, 0.0)
+        lowest = min(lowest, swept.min())
     return impulse, lowest
 
 
@@ -102,9 +104,12 @@ def run_deep_box():
 
 def sweep_one_by_one():
     """Return the impulses (SWEEPS + 1, 8) [N s] after each sweep of `pgs` from zero."""
-    toy, impulse = make_problem(), np.zeros((SWEEPS + 1, N))
+    toy = make_problem()
+    impulse = np.zeros((SWEEPS + 1, N))
     for sweep in range(SWEEPS):
-        impulse[sweep + 1] = lv.solve(toy, "pgs", impulse=impulse[sweep], tol=0.0, max_iter=1).impulse
+        impulse[sweep + 1] = lv.solve(
+            toy, "pgs", impulse=impulse[sweep], tol=0.0, max_iter=1
+        ).impulse
     return impulse
 
 
@@ -125,7 +130,9 @@ def numbers():
         problem=make_problem,
         exact=lambda: solve_exactly(found["problem"]),
         resting=lambda: solve_exactly(make_problem(0.0)),
-        as_qp=lambda: {n: lv.solve(make_problem(0.0), n, tol=TOL, max_iter=100_000) for n in SOLVERS},
+        as_qp=lambda: {
+            n: lv.solve(make_problem(0.0), n, tol=TOL, max_iter=100_000) for n in SOLVERS
+        },
         impulse=sweep_one_by_one,
         r_p=lambda: np.array([compute_natural_map(found["problem"], x) for x in found["impulse"]]),
         active_slack=lambda: largest_active_slack(found),
@@ -154,8 +161,14 @@ def draw_impulses(axes, found):
     """Draw the eight impulses of the solution, at rest with those of every solver."""
     draw_bars(axes, found, lambda _, impulse: impulse)
     for (name, solution), marker in zip(found["as_qp"].items(), "x+1|", strict=True):
-        axes.plot(np.arange(1, N + 1) - 0.2, solution.impulse, "k" + marker, markersize=8, label=name)
-    axes.set(title="eight impulses, none negative", xlabel="contact, from the ground", ylabel="impulse [N s]")
+        axes.plot(
+            np.arange(1, N + 1) - 0.2, solution.impulse, "k" + marker, markersize=8, label=name
+        )
+    axes.set(
+        title="eight impulses, none negative",
+        xlabel="contact, from the ground",
+        ylabel="impulse [N s]",
+    )
     put_legend_right(axes)
 
 
@@ -164,13 +177,17 @@ def draw_slacks(axes, found):
     problems = {"at rest": make_problem(0.0), "hit from below": found["problem"]}
     draw_bars(axes, found, lambda name, impulse: problems[name].slack(impulse))
     title = "eight slacks: 0 where an impulse acts, positive where the contact opens"
-    axes.set(title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None))
+    axes.set(
+        title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None)
+    )
 
 
 def draw_by_sweep(axes, found):
     """Draw the impulse of each contact against the sweeps."""
     for i in range(N):
-        axes.plot(np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
+        axes.plot(
+            np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}"
+        )
         axes.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
     axes.set(
         title="crosses: solved without bounds, then clamped once",
@@ -186,11 +203,21 @@ def draw_residual(axes, found):
     sweeps = np.arange(SWEEPS + 1)
     axes.semilogy(sweeps, np.maximum(found["r_p"], 1e-17), label="$r_p$ [N s]")
     axes.semilogy(
-        sweeps, np.maximum(found["active_slack"], 1e-17), "--", label="largest |w| of\nloaded contacts [m/s]"
+        sweeps,
+        np.maximum(found["active_slack"], 1e-17),
+        "--",
+        label="largest |w| of\nloaded contacts [m/s]",
     )
-    opening = np.abs(found["impulse"] @ found["problem"].dense()[:, OPEN] - found["problem"].b[OPEN])
+    opening = np.abs(
+        found["impulse"] @ found["problem"].dense()[:, OPEN] - found["problem"].b[OPEN]
+    )
     axes.semilogy(sweeps, opening, ":", color="k", label="|w| of contact 5,\nwhich opens [m/s]")
-    axes.set(title="projected Gauss-Seidel, hit from below", xlabel="sweeps", xlim=(0, 200), ylim=(1e-16, 3))
+    axes.set(
+        title="projected Gauss-Seidel, hit from below",
+        xlabel="sweeps",
+        xlim=(0, 200),
+        ylim=(1e-16, 3),
+    )
     put_legend_right(axes)
 
 
@@ -204,7 +231,8 @@ PANELS = {
 
 def print_numbers(found):
     """Print the tables."""
-    toy, resting = found["problem"], make_problem(0.0)
+    toy = found["problem"]
+    resting = make_problem(0.0)
     print(f"{'contact':<20}" + "".join(f"{i + 1:>9}" for i in range(N)))
     for name, key, problem in (
         ("at rest", "resting", resting),
@@ -214,7 +242,9 @@ def print_numbers(found):
         slack = problem.slack(found[key])
         print(f"{f'{name}, N s':<20}" + "".join(f"{x + 0.0:>9.4f}" for x in found[key]))
         print(f"{'  slack, m/s':<20}" + "".join(f"{x + 0.0:>9.4f}" for x in slack.round(9)))
-    print(f"\nat rest, to {TOL:g}: largest difference from OSQP's optimum of the QP, and largest |slack|")
+    print(
+        f"\nat rest, to {TOL:g}: largest difference from OSQP's optimum of the QP, and largest |slack|"
+    )
     optimum = found["as_qp"]["osqp"].impulse
     for name, solution in found["as_qp"].items():
         distance = np.abs(solution.impulse - optimum).max()
@@ -249,7 +279,8 @@ def print_numbers(found):
         )
     print(f"\n{'contact 5':<12}{'impulse':>10}{'|A l - b|':>12}{'r_p':>10}")
     for name, key in (("A^-1 b", "equations"), ("clamped", "clamped"), ("solution", "exact")):
-        x, w = found[key][OPEN], toy.slack(found[key])[OPEN]
+        x = found[key][OPEN]
+        w = toy.slack(found[key])[OPEN]
         print(f"{name:<12}{x + 0.0:>10.4f}{abs(w):>12.4f}{abs(x - max(0.0, x - w)):>10.4f}")
     first, last = found["deep"][0], found["deep"][-1]
     print(

@@ -25,7 +25,8 @@ STARTS = ("open", "sticks")  # Motions whose impulse is a start.
 def motions(problem):
     """Return {mode: impulse (2,) [N s]} of every solution of a problem of one contact with one tangent."""
     (a_nn, a_nt), (_, a_tt) = problem.dense()
-    (b_n, b_t), mu = problem.b, problem.cones.mu[0]
+    (b_n, b_t) = problem.b
+    mu = problem.cones.mu[0]
     found = {"open": np.zeros(2)} if b_n <= 0.0 else {}
     sticks = np.linalg.solve(problem.dense(), problem.b)
     if abs(sticks[1]) <= mu * sticks[0]:
@@ -46,7 +47,10 @@ def numbers():
     for solver in lv.available(problem):
         for start in STARTS if lv.get(solver).impulse else ():
             end = lv.solve(problem, solver, impulse=found[start], tol=1e-9)
-            off = {name: lv.motion_error(problem, end.impulse, reference=x).rows for name, x in found.items()}
+            off = {
+                name: lv.motion_error(problem, end.impulse, reference=x).rows
+                for name, x in found.items()
+            }
             picks[solver, start] = min(off, key=off.get) if end.success else "not solved"
     return {"problem": problem, "motions": found, "picks": picks}
 
@@ -58,11 +62,15 @@ def main():
     for name, impulse in found["motions"].items():
         normal, tangent = problem.slack(impulse)
         relative = lv.residual(problem, impulse).relative
-        print(f"{name:<18} tip at {normal:5.2f}, {tangent:5.2f} m/s, relative residual {relative:.0e}")
+        print(
+            f"{name:<18} tip at {normal:5.2f}, {tangent:5.2f} m/s, relative residual {relative:.0e}"
+        )
     for (solver, start), name in found["picks"].items():
         print(f"{solver:<20} from the impulse of {start!r}: {name}")
     cone = lv.solve(problem.relaxed("cone"), tol=1e-12)
-    print("cone law: one motion, tip at {:.2f}, {:.2f} m/s".format(*(cone.slack.round(2) + 0.0)))  # no -0.00
+    print(
+        "cone law: one motion, tip at {:.2f}, {:.2f} m/s".format(*(cone.slack.round(2) + 0.0))
+    )  # no -0.00
 
 
 if __name__ == "__main__":

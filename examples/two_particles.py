@@ -66,7 +66,9 @@ def numbers():
     found = Numbers(
         hand=solve_by_hand,
         problem=lambda: lv.Simulation(build_scene()).constraint_problem(),
-        engine=lambda: lv.solve(found["problem"], "sequential_impulses", tol=0, max_iter=4).impulse[0],
+        engine=lambda: lv.solve(found["problem"], "sequential_impulses", tol=0, max_iter=4).impulse[
+            0
+        ],
         run=run_engine,
         # m, distance minus length of the rod
         drift=lambda: np.linalg.norm(found["run"][0][:, 1] - found["run"][0][:, 0], axis=1) - 1.0,
@@ -98,7 +100,9 @@ def print_numbers(found):
     print(f"impulse by hand {impulse:.6f} N s, in the engine {found['engine']:.6f} N s")
     for i in range(2):
         print(f"particle {i + 1}: velocity {VELOCITY[i]} -> {np.round(after[i], 6)} m/s")
-    print(f"the distance changes by at most {1e6 * np.abs(found['drift']).max():.1f} µm in {STEPS} steps")
+    print(
+        f"the distance changes by at most {1e6 * np.abs(found['drift']).max():.1f} µm in {STEPS} steps"
+    )
     change = np.abs(found["run"][1] - MASS @ VELOCITY).max()
     print(f"the momentum changes by at most {change:.1e} kg m/s")
 

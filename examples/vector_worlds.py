@@ -35,7 +35,8 @@ class Hoppers:
         import mujoco as mj
 
         self.engine = mj
-        self.model, self.substeps = mj.MjModel.from_xml_string(HOPPER), substeps
+        self.model = mj.MjModel.from_xml_string(HOPPER)
+        self.substeps = substeps
         self.datas = [mj.MjData(self.model) for _ in range(n)]
 
     def reset(self, seed):
@@ -88,7 +89,9 @@ def numbers(n=64, steps=50, iterations=None):
     """Return the number of worlds, times [s] of environments and judge, errors (steps, n) [m/s], rejected worlds."""
     envs, model, datas, name = make(n)
     scratch = lv.io.MujocoScratch(model)
-    rng, spent, errors = np.random.default_rng(0), np.zeros(2), np.empty((steps, n))
+    rng = np.random.default_rng(0)
+    spent = np.zeros(2)
+    errors = np.empty((steps, n))
     envs.reset(seed=0)
     if iterations is not None:
         for own in [model, *(env.unwrapped.model for env in getattr(envs, "envs", ()))]:
@@ -117,7 +120,9 @@ def main():
     print(f"verdicts alone      {judge:9.0f} steps/s")
     print(f"both                {n * steps / found['seconds'].sum():9.0f} steps/s")
     print(f"worst error         {found['errors'].max():9.1e} m/s")
-    print(f"above {ACCEPT:g} m/s     {found['refused'].sum():9d} of {n * steps} steps, not to learn from")
+    print(
+        f"above {ACCEPT:g} m/s     {found['refused'].sum():9d} of {n * steps} steps, not to learn from"
+    )
 
 
 if __name__ == "__main__":

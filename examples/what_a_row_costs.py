@@ -36,7 +36,8 @@ def numbers():
 def measure():
     """Measure all scenes alternately."""
     scenes = {
-        name: lv.Scene("stack", n=BOXES, solver_iterations=SWEEPS, **more) for name, more in DECLARED.items()
+        name: lv.Scene("stack", n=BOXES, solver_iterations=SWEEPS, **more)
+        for name, more in DECLARED.items()
     }
     rows = {name: lv.Simulation(scene).constraint_problem().m for name, scene in scenes.items()}
     times = {name: [] for name in scenes}
@@ -73,7 +74,9 @@ def print_numbers(found):
     times = get_shortest_times(found)
     print(f"{'declared':<26}{'rows':>6}{'ms a step':>12}{'over friction alone':>20}")
     for name, t in times.items():
-        print(f"{name:<26}{found['measured'][name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}")
+        print(
+            f"{name:<26}{found['measured'][name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}"
+        )
 
 
 def main(path="what_a_row_costs.png"):

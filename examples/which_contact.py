@@ -18,7 +18,9 @@ import lavender as lv
 
 MASSES = {"torso": 8.0, "thigh": 2.0, "shank": 1.0}  # kg
 LENGTH, FOOT, DT = 0.4, 0.1, 0.01  # m, m, s
-Q = np.array([0.0, 0.78, 0.1, 0.25, -0.55, -0.35, -0.05])  # x, z, pitch; hip and knee left, then right
+Q = np.array(
+    [0.0, 0.78, 0.1, 0.25, -0.55, -0.35, -0.05]
+)  # x, z, pitch; hip and knee left, then right
 SPEED = np.array([1.2, -0.9, 0.2, -0.5, -0.3, 1.5, 0.3])  # m/s, rad/s
 COMPLIANCE = 1e-3  # 1/kg
 MU = 0.2
@@ -28,14 +30,18 @@ def points(q):
     """Return the centres of the five bodies, and heel and toe of both feet, (9, 2) [m]."""
     x, z, pitch = q[:3]
     hip = np.array([x, z])
-    bodies, feet = [hip + 0.2 * np.array([np.sin(pitch), np.cos(pitch)])], []
+    bodies = [hip + 0.2 * np.array([np.sin(pitch), np.cos(pitch)])]
+    feet = []
     for i in (3, 5):
-        a, b = pitch + q[i], pitch + q[i] + q[i + 1]
+        a = pitch + q[i]
+        b = pitch + q[i] + q[i + 1]
         thigh, shank = (np.array([np.sin(angle), -np.cos(angle)]) for angle in (a, b))
         knee = hip + LENGTH * thigh
         ankle = knee + LENGTH * shank
         bodies += [hip + 0.5 * LENGTH * thigh, knee + 0.5 * LENGTH * shank]
-        half = 0.5 * FOOT * np.array([np.cos(b + 0.2), np.sin(b + 0.2)])  # a foot is fixed to its shank
+        half = (
+            0.5 * FOOT * np.array([np.cos(b + 0.2), np.sin(b + 0.2)])
+        )  # a foot is fixed to its shank
         feet += [ankle - half, ankle + half]
     return np.array(bodies + feet)
 
@@ -58,7 +64,11 @@ def robot():
     each = [MASSES["torso"], *[MASSES["thigh"], MASSES["shank"]] * 2]
     inertia = [0.1 * m * LENGTH**2 for m in each]
     mass = sum(m * j.T @ j for m, j in zip(each, jac[:5], strict=True))
-    mass = mass + sum(i * np.outer(s, s) for i, s in zip(inertia, spin, strict=True)) + 0.01 * np.eye(7)
+    mass = (
+        mass
+        + sum(i * np.outer(s, s) for i, s in zip(inertia, spin, strict=True))
+        + 0.01 * np.eye(7)
+    )
     force = -9.81 * sum(m * j[1] for m, j in zip(each, jac[:5], strict=True))
     free = SPEED + DT * np.linalg.solve(mass, force)
     knees = np.zeros((2, 7))
@@ -90,11 +100,17 @@ def numbers():
     def speed(other):
         return other.velocity(lv.solve(other, tol=1e-13).impulse)[0]
 
-    row, block, h = int(np.argmax(np.abs(g.target))), 2 + int(np.argmax(np.abs(g.mu[2:]))), 1e-5
-    moved = [replace(problem, b=problem.b + s * h * np.eye(problem.m)[row], guess=None) for s in (1, -1)]
+    row = int(np.argmax(np.abs(g.target)))
+    block = 2 + int(np.argmax(np.abs(g.mu[2:])))
+    h = 1e-5
+    moved = [
+        replace(problem, b=problem.b + s * h * np.eye(problem.m)[row], guess=None) for s in (1, -1)
+    ]
     rubbed = [
         replace(
-            problem, cones=replace(problem.cones, mu=problem.cones.mu + s * h * np.eye(6)[block]), guess=None
+            problem,
+            cones=replace(problem.cones, mu=problem.cones.mu + s * h * np.eye(6)[block]),
+            guess=None,
         )
         for s in (1, -1)
     ]
@@ -118,7 +134,9 @@ def figure(found, path):
     left, right = canvas.subplots(1, 2)
     left.barh([p.row_name(i) for i in range(p.m)], found["target"])
     left.set(xlabel="d speed / d target [-]")
-    right.barh([f"{p.names[i]}: {found['d'].states[i].name}" for i in range(2, 6)], 1e3 * found["mu"][2:])
+    right.barh(
+        [f"{p.names[i]}: {found['d'].states[i].name}" for i in range(2, 6)], 1e3 * found["mu"][2:]
+    )
     right.set(xlabel="d speed / d mu [mm/s]")
     for axes in (left, right):
         axes.invert_yaxis()

@@ -113,15 +113,75 @@ _LAZY_MODULES = {
 }
 
 __all__ = [
-    "CONTACT", "CONTACT_BOX", "CONTACT_ELLIPSE", "CONTACT_ROLLING", "CONTACT_SPIN", "ROUND", "ROW", "SOLVER_FIELDS",
-    "Batch", "CapabilityError", "Claim", "Cones", "CrossCheck", "Derivative", "Diagnostic", "Generalized", "History",
-    "InUse", "InputError", "LavenderError", "MotionError", "Plan", "Problem", "QPSolution", "Redundancy", "Residual",
-    "Residuals", "RowBuilder", "Rows", "Scene", "Simulation", "SlipExplanation", "Snapshot", "Solution", "Solutions",
-    "SolveFailed", "SolverSpec", "SolverStage", "SolverUnavailable", "Status", "UnknownName", "__version__",
-    "available", "available_solvers", "cross_check", "derivative", "derivatives", "diagnose", "engine", "explain",
-    "explain_slip", "get", "io", "known", "load", "motion_error", "prepare", "qp", "redundancy", "register", "report",
-    "residual", "residual_many", "scene", "solve", "solve_many", "solve_qp", "suite",
-]  # fmt: skip
+    "CONTACT",
+    "CONTACT_BOX",
+    "CONTACT_ELLIPSE",
+    "CONTACT_ROLLING",
+    "CONTACT_SPIN",
+    "ROUND",
+    "ROW",
+    "SOLVER_FIELDS",
+    "Batch",
+    "CapabilityError",
+    "Claim",
+    "Cones",
+    "CrossCheck",
+    "Derivative",
+    "Diagnostic",
+    "Generalized",
+    "History",
+    "InUse",
+    "InputError",
+    "LavenderError",
+    "MotionError",
+    "Plan",
+    "Problem",
+    "QPSolution",
+    "Redundancy",
+    "Residual",
+    "Residuals",
+    "RowBuilder",
+    "Rows",
+    "Scene",
+    "Simulation",
+    "SlipExplanation",
+    "Snapshot",
+    "Solution",
+    "Solutions",
+    "SolveFailed",
+    "SolverSpec",
+    "SolverStage",
+    "SolverUnavailable",
+    "Status",
+    "UnknownName",
+    "__version__",
+    "available",
+    "available_solvers",
+    "cross_check",
+    "derivative",
+    "derivatives",
+    "diagnose",
+    "engine",
+    "explain",
+    "explain_slip",
+    "get",
+    "io",
+    "known",
+    "load",
+    "motion_error",
+    "prepare",
+    "qp",
+    "redundancy",
+    "register",
+    "report",
+    "residual",
+    "residual_many",
+    "scene",
+    "solve",
+    "solve_many",
+    "solve_qp",
+    "suite",
+]
 
 
 if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
@@ -133,7 +193,9 @@ if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they rep
             value = getattr(import_module_under_lock(_MODULE_OF_NAME[name]), name)
         else:
             module = sys.modules[__name__]
-            raise AttributeError(f"module 'lavender' has no attribute {name!r}", name=name, obj=module)
+            raise AttributeError(
+                f"module 'lavender' has no attribute {name!r}", name=name, obj=module
+            )
         globals()[name] = value
         return value
 

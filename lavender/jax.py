@@ -20,7 +20,9 @@ try:
     import jax
     import jax.numpy as jnp
 except ImportError as error:
-    raise SolverUnavailable("lavender.jax needs JAX: pip install 'lavender-contact[jax]', or jax") from error
+    raise SolverUnavailable(
+        "lavender.jax needs JAX: pip install 'lavender-contact[jax]', or jax"
+    ) from error
 
 
 def _call(function: Any, like: Any, arrays: Any) -> Any:

@@ -65,13 +65,28 @@ def solve_qp(
         None if no solution was found.
     """
     answer = quadratic.solve_qp(
-        P, q, G, h, A, b, lb, ub, solver or "auto", initvals, verbose, **{"tol": DEFAULT_TOL, **kwargs}
+        P,
+        q,
+        G,
+        h,
+        A,
+        b,
+        lb,
+        ub,
+        solver or "auto",
+        initvals,
+        verbose,
+        **{"tol": DEFAULT_TOL, **kwargs},
     )
     return np.array(answer.x) if answer.found else None
 
 
 def solve_problem(
-    problem: Any, solver: str | None = None, initvals: Any = None, verbose: bool = False, **kwargs: Any
+    problem: Any,
+    solver: str | None = None,
+    initvals: Any = None,
+    verbose: bool = False,
+    **kwargs: Any,
 ) -> QPSolution:
     """Solve a `qpsolvers.Problem` and return its solution with the multipliers.
 
@@ -83,5 +98,9 @@ def solve_problem(
     """
     program = problem if isinstance(problem, Problem) else Problem.from_qp(problem)
     return quadratic.solve_qp(
-        program, solver=solver or "auto", initvals=initvals, verbose=verbose, **{"tol": DEFAULT_TOL, **kwargs}
+        program,
+        solver=solver or "auto",
+        initvals=initvals,
+        verbose=verbose,
+        **{"tol": DEFAULT_TOL, **kwargs},
     )

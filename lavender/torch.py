@@ -40,12 +40,17 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
         """Compute the gradients by all arrays."""
-        return None, *_Adjoint.apply(ctx.step, ctx.needs_input_grad[1:], *ctx.saved_tensors, *cotangents)
+        return None, *_Adjoint.apply(
+            ctx.step, ctx.needs_input_grad[1:], *ctx.saved_tensors, *cotangents
+        )
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, step: Step, *arrays: Any) -> Any:
         """Solve with one more leading batch axis."""
-        return _Solve.apply(step, *_move_batch_axis(info, in_dims[1:], arrays, ARGUMENT_AXES)), (0, 0)
+        return _Solve.apply(step, *_move_batch_axis(info, in_dims[1:], arrays, ARGUMENT_AXES)), (
+            0,
+            0,
+        )
 
 
 class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
@@ -54,7 +59,9 @@ class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def forward(step: Step, needed: Any, *arrays: Any) -> Any:
         """Compute the gradients by all arrays."""
-        return tuple(map(torch.from_numpy, step.backward(needed, *(x.detach().numpy() for x in arrays))))
+        return tuple(
+            map(torch.from_numpy, step.backward(needed, *(x.detach().numpy() for x in arrays)))
+        )
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
@@ -63,7 +70,9 @@ class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
         """Raise NotImplementedError: there are no second derivatives."""
-        raise NotImplementedError("lavender.torch has first derivatives only: leave create_graph=True out")
+        raise NotImplementedError(
+            "lavender.torch has first derivatives only: leave create_graph=True out"
+        )
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, step: Step, needed: Any, *arrays: Any) -> Any:
@@ -82,7 +91,9 @@ def _move_batch_axis(info: Any, dims: Any, arrays: Any, axes: Any) -> list[Any]:
     out = []
     for x, d, n in zip(arrays, dims, axes, strict=True):
         y = x.expand(info.batch_size, *x.shape) if d is None else x.movedim(d, 0)
-        out.append(y.reshape(y.shape[0], *(1,) * (n_inner - (y.ndim - 1 - n)), *y.shape[1:]).contiguous())
+        out.append(
+            y.reshape(y.shape[0], *(1,) * (n_inner - (y.ndim - 1 - n)), *y.shape[1:]).contiguous()
+        )
     return out
 
 
@@ -139,7 +150,9 @@ def solve(
         if x is None and i > 3:
             arguments[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
         elif not isinstance(x, torch.Tensor):
-            raise InputError(f"{name} is {type(x).__name__}; a float64 tensor is needed: torch.as_tensor")
+            raise InputError(
+                f"{name} is {type(x).__name__}; a float64 tensor is needed: torch.as_tensor"
+            )
         elif x.dtype != torch.float64 or x.device.type != "cpu":  # pyright: ignore[reportOptionalMemberAccess]
             raise InputError(
                 f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"  # pyright: ignore[reportOptionalMemberAccess]

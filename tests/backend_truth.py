@@ -15,12 +15,17 @@ PROXIMAL = {"eps_abs": TOL, "eps_rel": 0.0}
 GAPS = {f"eps_duality_gap_{kind}": TOL for kind in ("abs", "rel")}
 ALONE = {
     "osqp": {"eps_abs": TOL, "eps_rel": 0.0, "max_iter": 100_000, "polishing": True},
-    "clarabel": {"tol_feas": TOL, "tol_gap_abs": TOL, "tol_gap_rel": TOL}, "piqp": PROXIMAL | GAPS,
-    "proxqp": PROXIMAL | GAPS | {"check_duality_gap": True}, "qpalm": PROXIMAL,
+    "clarabel": {"tol_feas": TOL, "tol_gap_abs": TOL, "tol_gap_rel": TOL},
+    "piqp": PROXIMAL | GAPS,
+    "proxqp": PROXIMAL | GAPS | {"check_duality_gap": True},
+    "qpalm": PROXIMAL,
     "daqp": {"primal_tol": TOL, "dual_tol": TOL},
     "highs": {f"{kind}_feasibility_tolerance": TOL for kind in ("primal", "dual")},
-    "scs": PROXIMAL | {"max_iters": 100_000}, "cvxopt": INTERIOR, "kvxopt": INTERIOR, "ecos": INTERIOR,
-}  # fmt: skip
+    "scs": PROXIMAL | {"max_iters": 100_000},
+    "cvxopt": INTERIOR,
+    "kvxopt": INTERIOR,
+    "ecos": INTERIOR,
+}
 
 
 def draw_program(seed):
@@ -34,7 +39,8 @@ def draw_program(seed):
     root = rng.normal(size=(rank, n))
     P = root.T @ root + (0.1 * np.eye(n) if rank == n else 0.0)
     x, q = rng.normal(size=n), rng.normal(size=n)
-    n_g, n_a = int(rng.integers(0, 3 * n + 1)), int(rng.integers(0, max(1, n // 2)))
+    n_g = int(rng.integers(0, 3 * n + 1))
+    n_a = int(rng.integers(0, max(1, n // 2)))
     G, A = rng.normal(size=(n_g, n)), rng.normal(size=(n_a, n))
     if seed % 3 == 0:
         G = np.vstack([G, *(G[:1] * [[1.0], [2.0]] if n_g else [])])
@@ -56,12 +62,14 @@ def draw_kind(seed):
 
     Placeholder bounds are inactive bounds of 1e3 to 1e19, which users write for "no bound".
     """
-    kind, turn = KINDS[seed % len(KINDS)], seed // len(KINDS) % 2
+    kind = KINDS[seed % len(KINDS)]
+    turn = seed // len(KINDS) % 2
     # The seed of `draw_program` decides definiteness (even) and repeated rows (a multiple of 3).
     first = {"definite": 2, "singular": 1, "repeated": 3 * turn, "placeholder": 1 + turn}[kind]
     program = draw_program(6 * (1000 + seed) + first)
     if kind == "placeholder":
-        rng, n = np.random.default_rng(seed), len(program["q"])
+        rng = np.random.default_rng(seed)
+        n = len(program["q"])
         far = np.full(n, 10.0 ** rng.integers(3, 20))
         # With this q, the objective has a minimum without bounds also if P is singular.
         program |= {"q": program["P"] @ rng.normal(size=n), "lb": -far, "ub": far}
@@ -75,7 +83,8 @@ def draw_lcp(seed):
     root = rng.normal(size=(n, int(rng.integers(1, n + 1))))
     A = root @ root.T
     A = (A + A.T) / 2.0
-    x, active = rng.random(n), rng.random(n) < 0.5
+    x = rng.random(n)
+    active = rng.random(n) < 0.5
     return {"P": A, "q": -(A @ (x * active) - rng.random(n) * ~active), "lb": np.zeros(n)}
 
 
@@ -101,7 +110,8 @@ def compute_kkt_error(program, x, y=None, z=None, z_box=None):
     b, h, low, high = (np.asarray(program.get(name, missing)) for name, missing in ends.items())
     terms = program["P"] @ x, program["q"], A.T @ y, G.T @ z, box
     ax, gx = A @ x, G @ x
-    force, size = largest(*terms), largest(ax, b, gx, h, x)
+    force = largest(*terms)
+    size = largest(ax, b, gx, h, x)
     gap = np.concatenate([gx - h, low - x, x - high])
     w = np.concatenate([z, np.maximum(-box, 0.0), np.maximum(box, 0.0)])
     is_finite = np.isfinite(gap)
@@ -130,7 +140,8 @@ def call_alone(program, name, tol=TOL):
 def call_here(program, name, is_lcp, tol=TOL):
     """Return the answer's KKT error and the `Solution`, of the backend called by this package."""
     if is_lcp:
-        A, b = program["P"], -program["q"]
+        A = program["P"]
+        b = -program["q"]
         solution = lv.solve(lv.Problem.lcp(A, b), name, tol=tol)
         x = solution.impulse
         return compute_kkt_error(program, x, z_box=-np.maximum(A @ x - b, 0.0)), solution

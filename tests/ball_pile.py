@@ -26,10 +26,12 @@ class Pile:
         rng = np.random.default_rng(seed)
         n = int(rng.integers(40, 170))
         self.mu = float(rng.choice([0.3, 0.5, 0.5, 0.7, 1.0]))
-        spread, heavy = rng.choice([0.0, 0.0, 0.1, 0.3]), rng.choice([1.0, 1.0, 10.0])
+        spread = rng.choice([0.0, 0.0, 0.1, 0.3])
+        heavy = rng.choice([1.0, 1.0, 10.0])
         self.radius = 0.5 * (1.0 + spread * rng.uniform(-1.0, 1.0, n))  # m
         self.side = np.ceil((n / rng.choice([1.0, 2.0])) ** (1 / 3)) + rng.choice([0.2, 0.6, 1.0])  # m
-        k, i = int(self.side), np.arange(n)
+        k = int(self.side)
+        i = np.arange(n)
         grid = [(i % k + 0.6) * self.side / k, i // k**2 * 1.1 + 0.55, (i // k % k + 0.6) * self.side / k]
         self.place = np.transpose(grid) + rng.uniform(-0.05, 0.05, (n, 3))
         self.mass = np.where(rng.random(n) < 0.1, heavy, 1.0) * (self.radius / 0.5) ** 3  # kg
@@ -57,12 +59,15 @@ class Pile:
         target = np.zeros((len(gap), 3))
         target[:, 0] = np.where(gap > 0.0, -gap / DT, np.clip(0.2 * (-gap - 0.005) / DT, 0.0, 1.0))
         rows = lv.Rows(
-            inv_mass=1.0 / self.mass, inv_inertia=(2.5 / (self.mass * self.radius**2))[:, None, None] * np.eye(3),
-            v_free=self.velocity - [0.0, 9.81 * DT, 0.0, 0.0, 0.0, 0.0], contact_body=body, normal=normal,
+            inv_mass=1.0 / self.mass,
+            inv_inertia=(2.5 / (self.mass * self.radius**2))[:, None, None] * np.eye(3),
+            v_free=self.velocity - [0.0, 9.81 * DT, 0.0, 0.0, 0.0, 0.0],
+            contact_body=body,
+            normal=normal,
             tangent=tangent / np.linalg.norm(tangent, axis=1, keepdims=True),
             arm_a=np.where(body[:, :1] >= 0, normal * self.radius[body[:, :1]], 0.0),
             arm_b=-normal * self.radius[body[:, 1:]],
-        )  # fmt: skip
+        )
         # A wall is told by the axis of its normal.
         name = np.where(body[:, 0] >= 0, body[:, 0], len(self.mass) + abs(normal).argmax(axis=1))
         key = (name.astype(np.uint64) << np.uint64(32)) | body[:, 1].astype(np.uint64)
@@ -76,5 +81,6 @@ class Pile:
             yield step, problem
             start = None if last is None else problem.carry(last)
             impulse = lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse
-            self.velocity, last = problem.velocity(impulse).reshape(-1, 6), (problem, impulse)
+            self.velocity = problem.velocity(impulse).reshape(-1, 6)
+            last = (problem, impulse)
             self.place += DT * self.velocity[:, :3]

@@ -64,7 +64,8 @@ class Clock:
 def dense(m, law, seed=0):
     rng = np.random.default_rng(seed)
     half = rng.normal(size=(m, m // 2))
-    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
+    a = half @ half.T / m + 0.01 * np.eye(m)
+    b = rng.normal(size=m)
     return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
 
 
@@ -113,9 +114,14 @@ def robot(seed, m=12, n=10, soft=True, number=np.float64):
     compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
     upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
     return lv.Problem.from_jacobian(
-        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
-        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
-    )  # fmt: skip
+        jac.astype(number),
+        mass.astype(number),
+        rng.normal(size=n).astype(number),
+        target=rng.uniform(-0.1, 0.1, m),
+        cones=lv.Cones.bounded(np.zeros(m), upper),
+        compliance=compliance if soft else None,
+        name=f"robot {seed}",
+    )
 
 
 MORE, REACHED, CERTIFICATE = 0, 1, 4
@@ -124,13 +130,15 @@ MORE, REACHED, CERTIFICATE = 0, 1, 4
 def driven(problem, tol=1e-9, budget=1500, work=10**6):
     """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse = Driver(problem.metric), problem.start().copy()
+    driver = Driver(problem.metric)
+    impulse = problem.start().copy()
     if not driver.fits:
         return None
     driver.start(impulse, tol, budget)
     how = MORE
     while how in (MORE, CERTIFICATE):
-        how, proof = driver.step(work, impulse), driver.direction
+        how = driver.step(work, impulse)
+        proof = driver.direction
         if proof is not None and check_certificate(problem, proof) is None:
             driver.confirm_certificate()
     return how, driver.counts[1], driver.relative, impulse
@@ -150,7 +158,8 @@ def block_diagonal(system, values):
     sc = system.solve.view_arrays()
     out = np.zeros((sc.m, sc.m))
     for i, q in enumerate(sc.wptr[:-1]):
-        j, end = sc.ptr[i], sc.ptr[i + 1]
+        j = sc.ptr[i]
+        end = sc.ptr[i + 1]
         out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
     return out
 

@@ -24,9 +24,16 @@ import lavender as lv
 LARGEST = 1e60
 SPECIAL = (0.0, 5e-324, 1e-300, 1e-61, 1e-60, 1e-59, 1e-30, 1e-20, 1.0, 1.0 + 2.0**-52, 1e20, 1e30, 1e59, LARGEST)
 SHAPES = {
-    "inv_inertia": (-1, 3, 3), "v_free": (-1, 6), "jac": (-1, 12), "joint_body": (-1, 2), "contact_body": (-1, 2),
-    "normal": (-1, 3), "tangent": (-1, 3), "arm_a": (-1, 3), "arm_b": (-1, 3),
-}  # fmt: skip
+    "inv_inertia": (-1, 3, 3),
+    "v_free": (-1, 6),
+    "jac": (-1, 12),
+    "joint_body": (-1, 2),
+    "contact_body": (-1, 2),
+    "normal": (-1, 3),
+    "tangent": (-1, 3),
+    "arm_a": (-1, 3),
+    "arm_b": (-1, 3),
+}
 INDICES = ("joint_ptr", "joint_body", "contact_body", "ptr", "kind")
 
 
@@ -46,9 +53,14 @@ def build_problem(data):
     if data["operator"] == "general":
         n = len(data["v_free"])
         return lv.Problem.from_jacobian(
-            np.array(data["J"], float).reshape(-1, n), np.array(data["M"], float).reshape(n, n), data["v_free"],
-            target=data["target"], compliance=data.get("compliance"), cones=cones, **more,
-        )  # fmt: skip
+            np.array(data["J"], float).reshape(-1, n),
+            np.array(data["M"], float).reshape(n, n),
+            data["v_free"],
+            target=data["target"],
+            compliance=data.get("compliance"),
+            cones=cones,
+            **more,
+        )
     b = np.array(data["b"], float)
     if data["operator"] == "rows":
         arrays = {
@@ -75,7 +87,8 @@ def bounded_blocks(seed):
     m = size.sum()
     a = rng.normal(size=(m, rng.integers(1, m + 3)))
     lower, upper = np.sort(rng.normal(size=(2, m)), axis=0)
-    lower, upper = np.where(rng.random(m) < 0.3, -np.inf, lower), np.where(rng.random(m) < 0.3, np.inf, upper)
+    lower = np.where(rng.random(m) < 0.3, -np.inf, lower)
+    upper = np.where(rng.random(m) < 0.3, np.inf, upper)
     upper = np.where((rng.random(m) < 0.1) & np.isfinite(lower), lower, upper)
     nothing = np.zeros(len(size))
     cones = lv.Cones(np.cumsum([0, *size]), nothing.astype(int), lower, upper, nothing, nothing)
@@ -84,7 +97,8 @@ def bounded_blocks(seed):
 
 def many_islands(seed):
     """Build 10 to 24 small problems beside each other, more than `auto` solves as one."""
-    rng, law = np.random.default_rng(seed), ("coulomb", "cone")[seed % 2]
+    rng = np.random.default_rng(seed)
+    law = ("coulomb", "cone")[seed % 2]
     parts = [random_lcp(seed + i, m=int(rng.integers(1, 4))) for i in range(rng.integers(9, 23))]
     contacts = as_matrix(random_contact_problem(seed, law, bodies=2, joints=1, contacts=2))
     return side_by_side([contacts, *parts])
@@ -94,7 +108,8 @@ def contacts(kind, form):
     """Return the maker of small problems with these contacts, given in this form."""
 
     def make(seed):
-        rng, law = np.random.default_rng(seed), ("coulomb", "cone")[seed % 2]
+        rng = np.random.default_rng(seed)
+        law = ("coulomb", "cone")[seed % 2]
         sizes = {
             "bodies": int(rng.integers(2, 5)),
             "joints": int(rng.integers(0, 3)),
@@ -108,13 +123,15 @@ def contacts(kind, form):
 MAKERS = {
     **{f"{kind}, {form}": contacts(kind, form) for kind in CONTACTS for form in FORMS},
     "lcp": lambda seed: random_lcp(seed, m=1 + seed % 12),
-    "singular lcp": lambda seed: random_lcp(seed, m=4 + seed % 9, rank=1 + seed % 3), "linear": linear,
-    "bounded blocks": bounded_blocks, "nearly singular M": nearly_singular,
+    "singular lcp": lambda seed: random_lcp(seed, m=4 + seed % 9, rank=1 + seed % 3),
+    "linear": linear,
+    "bounded blocks": bounded_blocks,
+    "nearly singular M": nearly_singular,
     "many islands": many_islands,
     "round cones": lambda seed: random_generalized_problem(
         seed, "cone", 1 + seed % 9, seed % 4 > 0, contacts=1 + seed % 2, tangents=3 + seed % 3
     ),
-}  # fmt: skip
+}
 
 
 def replaced(x, how, rng):
@@ -152,8 +169,25 @@ def change(data, name, how, seed):
     home[name] = np.clip(sign(x), -LARGEST, LARGEST).tolist()
 
 
-ARRAYS = ("b", "A", "J", "M", "v_free", "target", "compliance", "mu", "patch_radius", "rolling", "lower", "upper",
-          "inv_mass", "inv_inertia", "jac", "arm_a", "arm_b")  # fmt: skip
+ARRAYS = (
+    "b",
+    "A",
+    "J",
+    "M",
+    "v_free",
+    "target",
+    "compliance",
+    "mu",
+    "patch_radius",
+    "rolling",
+    "lower",
+    "upper",
+    "inv_mass",
+    "inv_inertia",
+    "jac",
+    "arm_a",
+    "arm_b",
+)
 CHANGES = ("scaled entries", "scaled", "a zero row", "a copied row", "special numbers")
 
 

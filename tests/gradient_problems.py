@@ -9,10 +9,13 @@ from random_problems import random_bodies_and_contacts
 import lavender as lv
 
 KINDS = {
-    "free": lambda rng: lv.Cones.free(2), "bounded": lambda rng: lv.Cones.bounded([-0.3, 0.0], [0.3, np.inf]),
-    "equal": lambda rng: lv.Cones.bounded([0.2], [0.2]), "normal": lambda rng: lv.Cones.contacts(0.0, 0),
+    "free": lambda rng: lv.Cones.free(2),
+    "bounded": lambda rng: lv.Cones.bounded([-0.3, 0.0], [0.3, np.inf]),
+    "equal": lambda rng: lv.Cones.bounded([0.2], [0.2]),
+    "normal": lambda rng: lv.Cones.contacts(0.0, 0),
     "line": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 1),
-    "disk": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0)), "smooth": lambda rng: lv.Cones.contacts(0.0),
+    "disk": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0)),
+    "smooth": lambda rng: lv.Cones.contacts(0.0),
     "spin": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, 0.3),
     "spin alone": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 0, 0.4),
     "ellipse": lambda rng: lv.Cones.contacts([rng.uniform(0.2, 1.0, 2)]),
@@ -20,7 +23,7 @@ KINDS = {
     "rolling": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, rolling=0.2),
     "rolling and spin": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 2, 0.3, rolling=0.2),
     "round": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 5),
-}  # fmt: skip
+}
 OPERATORS = ("dense", "csr", "asymmetric", "generalized", "bodies")
 
 
@@ -132,7 +135,8 @@ def named(name, change):
 
 def moved(problem, name, change, h):
     """The problem with h times the change added to its data."""
-    p, c = problem, problem.cones
+    p = problem
+    c = problem.cones
     if name == "b":
         return replace(p, b=p.b + h * change)
     if name in ("mu", "patch_radius", "rolling"):

@@ -21,7 +21,8 @@ def draw_bounds(rng, m):
     lower = np.where(kind < 2, 0.0, lower)
     upper = np.where(kind == 0, np.inf, np.where(kind == 1, np.abs(upper), upper))
     upper = np.where((kind == 2) & (np.abs(lower) < 1e30), lower, upper)
-    lower, upper = np.where(kind == 3, -np.inf, lower), np.where(kind == 3, np.inf, upper)
+    lower = np.where(kind == 3, -np.inf, lower)
+    upper = np.where(kind == 3, np.inf, upper)
     return np.where(lower == np.inf, 0.0, lower), np.where(upper == -np.inf, 0.0, upper)
 
 
@@ -46,13 +47,15 @@ def draw_rhs(rng, m):
 def draw_row_problem(seed, max_rows=24):
     """Draw bounded rows and contacts over J and M, or over their A."""
     rng = np.random.default_rng([118, seed])
-    contacts, rows = int(rng.integers(0, 4)) * int(rng.random() < 0.6), int(rng.integers(1, max_rows - 8))
+    contacts = int(rng.integers(0, 4)) * int(rng.random() < 0.6)
+    rows = int(rng.integers(1, max_rows - 8))
     cones = lv.Cones.bounded(*draw_bounds(rng, rows))
     if contacts:
         cones = cones + lv.Cones.contacts(rng.choice([0.0, 0.5, 1.0, 1e-6, 1e6], contacts))
     m = len(cones.lower)
     n = int(rng.integers(1, 2 * m))
-    jac, b = draw_rows(rng, m, n), draw_rhs(rng, m)
+    jac = draw_rows(rng, m, n)
+    b = draw_rhs(rng, m)
     mass = np.diag(10.0 ** (rng.integers(-6, 7, n) if rng.random() < 0.3 else np.zeros(n)))
     if rng.random() < 0.5:
         half = rng.standard_normal((n, n)) * np.sqrt(np.diag(mass))[:, None]
@@ -82,9 +85,15 @@ def draw_body_problem(seed):
     )
     target = draw_rhs(rng, problem.m) if rng.random() < 0.5 else np.zeros(problem.m)
     problem = lv.Problem.from_rows(
-        rows, target=target, lower=problem.cones.lower[: len(rows.jac)], upper=problem.cones.upper[: len(rows.jac)],
-        mu=0.5, tangents=2, friction=problem.friction, compliance=np.where(rng.random(len(target)) < 0.1, 0.01, 0.0),
-    )  # fmt: skip
+        rows,
+        target=target,
+        lower=problem.cones.lower[: len(rows.jac)],
+        upper=problem.cones.upper[: len(rows.jac)],
+        mu=0.5,
+        tangents=2,
+        friction=problem.friction,
+        compliance=np.where(rng.random(len(target)) < 0.1, 0.01, 0.0),
+    )
     return problem
 
 

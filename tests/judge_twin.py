@@ -90,7 +90,8 @@ def refined_inverse(lower, mass, right):
     x = solve(right)
     if not (np.isfinite(x).all() and np.abs(x).max(initial=ZERO) < 1e300):
         return x
-    whole, given = as_integers(mass), as_integers(right) << BITS
+    whole = as_integers(mass)
+    given = as_integers(right) << BITS
     for _ in range(3):
         x += solve(as_long(given - whole @ as_integers(x)))
     return x
@@ -105,9 +106,11 @@ def project_cone(z, d, bounds, sqrt=np.sqrt):
     size = [norm(z[at], sqrt) for at, _ in bounds]
     n = max(0 * d[0], z[0])
     for counts in list(itertools.product((0, 1), repeat=len(bounds)))[1:]:
-        pull, weight = d[0] * z[0], d[0]
+        pull = d[0] * z[0]
+        weight = d[0]
         for use, (at, reach), t in zip(counts, bounds, size, strict=True):
-            pull, weight = pull + use * d[at[0]] * reach * t, weight + use * d[at[0]] * reach**2
+            pull = pull + use * d[at[0]] * reach * t
+            weight = weight + use * d[at[0]] * reach**2
         n = max(n, pull / weight)
     out = z.copy()
     out[0] = n
@@ -141,9 +144,11 @@ class Problem:
         jac = np.array(spec["J"], L).reshape(-1, len(spec["v_free"])) if general else None
         if general:
             v, target = np.array(spec["v_free"], L), np.array(spec["target"], L)
-            self.b, self.b_size = target - jac @ v, np.abs(target) + np.abs(jac) @ np.abs(v)
+            self.b = target - jac @ v
+            self.b_size = np.abs(target) + np.abs(jac) @ np.abs(v)
             if "b" in spec:  # of an update
-                self.b, self.b_size = np.array(spec["b"], L), np.abs(np.array(spec["b"], L))
+                self.b = np.array(spec["b"], L)
+                self.b_size = np.abs(np.array(spec["b"], L))
             self.terms = np.abs(self.b + jac @ v) + np.abs(jac) @ np.abs(v)
         else:
             self.b = np.array(spec["b"], L)
@@ -154,7 +159,8 @@ class Problem:
         self.operator = "general" if general else "rows" if "rows" in spec else "matrix"
         self.m = len(self.b)
         self.stretch = self._stretch()
-        self.roundings, self.of_factor = self.m + 20, ZERO
+        self.roundings = self.m + 20
+        self.of_factor = ZERO
         if general:
             self._of_general(jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L))
         elif "rows" in spec:
@@ -171,7 +177,8 @@ class Problem:
 
     def _stretch(self):
         """An ellipse is measured as the disk of its larger coefficient in rows that are so long (m,)."""
-        c, out = self.cones, np.ones(self.m, L)
+        c = self.cones
+        out = np.ones(self.m, L)
         self.mu = np.array(c["mu"], L)
         for k in np.flatnonzero(c["kind"] == CONTACT_ELLIPSE):
             sides = np.array([1.0, c["patch_radius"][k]], L)
@@ -182,7 +189,8 @@ class Problem:
     # -- the operator ------------------------------------------------------------------------------
 
     def _of_matrix(self):
-        diag, big = np.diag(self.A).copy(), self.size.max(axis=1, initial=ZERO)
+        diag = np.diag(self.A).copy()
+        big = self.size.max(axis=1, initial=ZERO)
         d = np.where(diag > L(1e-10) * big, diag, big)
         self.empty = big < LEAST
         self.d = self._filled(d, ~self.empty)
@@ -198,7 +206,8 @@ class Problem:
 
     def _of_rows(self, spec):
         r = {key: np.array(value) for key, value in spec["rows"].items()}
-        n, m = len(r["inv_mass"]), self.m
+        n = len(r["inv_mass"])
+        m = self.m
         ptr, kind = self.cones["ptr"], self.cones["kind"]
         joints = len(r["joint_ptr"]) - 1
         jac, size = np.zeros((m, n, 6), L), np.zeros((m, n, 6), L)
@@ -232,7 +241,8 @@ class Problem:
                         size[row, body, 3:] = np.abs(turns[q - slides])
                     else:
                         arm = np.array(arm, L)
-                        jac[row, body, :3], jac[row, body, 3:] = sign * axes[q], sign * np.cross(arm, axes[q])
+                        jac[row, body, :3] = sign * axes[q]
+                        jac[row, body, 3:] = sign * np.cross(arm, axes[q])
                         # a cross product may cancel, and its float64 keeps only the digits of its terms
                         reach = np.sqrt(arm @ arm)
                         size[row, body, :3] = 1.0
@@ -278,7 +288,8 @@ class Problem:
         self.touches = (jac != 0) @ tree
         jac = self.stretch[:, None] * jac
         soft = self.stretch**2 * soft
-        lower, y = np.zeros((n, n), L), np.zeros((self.m, n), L)
+        lower = np.zeros((n, n), L)
+        y = np.zeros((self.m, n), L)
         for i in range(n):
             for j in range(i):
                 lower[i, j] = (mass[i, j] - lower[i, :j] @ lower[j, :j]) / lower[j, j]
@@ -314,22 +325,28 @@ class Problem:
 
     def slide(self, k):
         """Rows behind the normal of a contact that slide."""
-        size, kind = int(self.cones["ptr"][k + 1] - self.cones["ptr"][k]), self.cones["kind"][k]
+        size = int(self.cones["ptr"][k + 1] - self.cones["ptr"][k])
+        kind = self.cones["kind"][k]
         if kind == ROW:
             return 0
         return 2 if kind in (ROUND, CONTACT_ROLLING) else size - 1 - (kind == CONTACT_SPIN)
 
     def pairs(self, k):
         """Two rows that have one d, and count by their norm: those that slide in a disk, those that roll."""
-        j, end, kind = self.cones["ptr"][k], self.cones["ptr"][k + 1], self.cones["kind"][k]
+        j = self.cones["ptr"][k]
+        end = self.cones["ptr"][k + 1]
+        kind = self.cones["kind"][k]
         found = [slice(j + 1, j + 3)] if self.slide(k) == 2 and kind != CONTACT_BOX else []
         rolls = kind == CONTACT_ROLLING or (kind == ROUND and end - j == 6)
         return [*found, slice(end - 2, end)] if rolls else found
 
     def parts(self, k):
         """(places, most of their norm over lam_n) of all that a contact bounds by itself; no round cone."""
-        c, slide, mu = self.cones, self.slide(k), self.mu[k]
-        size, kind = int(c["ptr"][k + 1] - c["ptr"][k]), c["kind"][k]
+        c = self.cones
+        slide = self.slide(k)
+        mu = self.mu[k]
+        size = int(c["ptr"][k + 1] - c["ptr"][k])
+        kind = c["kind"][k]
         apart = mu * L(c["patch_radius"][k])
         if kind == CONTACT_BOX:
             return [([1], mu), ([2], apart)]
@@ -364,7 +381,8 @@ class Problem:
     def error(self, lam, w):
         """e (m,), by the law; w / d as it is where no bound acts, since lam - (lam - w / d) has fewer digits."""
         e = np.zeros(self.m, L)
-        c, step = self.cones, w / self.d
+        c = self.cones
+        step = w / self.d
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])
             if c["kind"][k] == ROW:
@@ -382,7 +400,8 @@ class Problem:
         e = step.copy()
         e[0] = min(step[0], lam[0])
         for at, reach in self.parts(k):
-            y, rim = lam[at] - step[at], reach * max(ZERO, lam[0])
+            y = lam[at] - step[at]
+            rim = reach * max(ZERO, lam[0])
             if len(at) == 1:
                 e[at] = np.minimum(np.maximum(step[at], lam[at] - rim), lam[at] + rim)
             elif np.sqrt(y @ y) > rim:
@@ -391,24 +410,31 @@ class Problem:
 
     def _cone(self, k, lam, step):
         """Error of the projection in the metric of d."""
-        z, d = lam - step, self.d[self.cones["ptr"][k] : self.cones["ptr"][k + 1]]
+        z = lam - step
+        d = self.d[self.cones["ptr"][k] : self.cones["ptr"][k + 1]]
         nearest = project_cone(z, d, self.parts(k))
         return np.where(nearest == z, step, lam - nearest)
 
     def _round(self, k, lam, step):
         """Error of the projection on sum (|y_g| / a_g)^2 <= y_n^2 by bisection on its multiplier."""
-        c, j = self.cones, self.cones["ptr"][k]
-        d, mu = self.d[j : c["ptr"][k + 1]], self.mu[k]
+        c = self.cones
+        j = self.cones["ptr"][k]
+        d = self.d[j : c["ptr"][k + 1]]
+        mu = self.mu[k]
         root = np.sqrt(d)
         y = root * (lam - step)
-        normal, y = y[0], y[1:]
+        normal = y[0]
+        y = y[1:]
         a = mu * root[1:] / root[0]
         size = np.abs(y)
         if mu == 0:
-            inside, top, scale = not y.any() and normal >= 0, max(ZERO, normal), np.zeros(len(y), L)
+            inside = not y.any() and normal >= 0
+            top = max(ZERO, normal)
+            scale = np.zeros(len(y), L)
         else:
             inside = normal >= 0 and ((size / a) ** 2).sum() <= normal * normal
-            top, scale = ZERO, np.zeros(len(y), L)
+            top = ZERO
+            scale = np.zeros(len(y), L)
             if not inside and normal + np.sqrt(((a * size) ** 2).sum()) > 0:
                 # top = base + rise: a narrow cone's (1 + a a) top - normal would lose its digits
                 base = max(ZERO, normal)
@@ -518,10 +544,19 @@ class Problem:
         seen = seen[(seen > 0) & np.isfinite(seen)]
         span = float(np.abs(np.log10(seen)).max(initial=0.0))
         return Judgement(
-            float(relative), float(floor), float(allowed), float(unrefined), float(100 * floor + unrefined),
-            float(energy), float(velocity), nothing, span, np.array(relatives, float), np.array(floors, float),
+            float(relative),
+            float(floor),
+            float(allowed),
+            float(unrefined),
+            float(100 * floor + unrefined),
+            float(energy),
+            float(velocity),
+            nothing,
+            span,
+            np.array(relatives, float),
+            np.array(floors, float),
             np.array([100 * floor + loss for floor, loss in zip(floors, losses, strict=True)], float),
-        )  # fmt: skip
+        )
 
     def _reference(self, rows, start, slack, error):
         """(E0, V0) of the rows of an island from the zero impulse, its slack and error; None if no row acts."""
@@ -532,7 +567,8 @@ class Problem:
         pushed = ((start == low) & (slack > rounding)) | ((start == high) & (-slack > rounding))
         acts = rows & ~(self._bounded() & (pushed | (low == high)))
         for part, parts in self._contacts():
-            gap, line = slack[part][0], np.abs(self.b[part][0])
+            gap = slack[part][0]
+            line = np.abs(self.b[part][0])
             if self.law == "cone":
                 gap -= sum(reach * norm(slack[part][at]) for at, reach in parts)
                 line += sum(reach * norm(self.b[part][at]) for at, reach in parts)
@@ -546,7 +582,9 @@ class Problem:
         A row: its error at the zero impulse above 2^-48 of its terms, otherwise its terms. A contact: likewise, of all
         rows together. With tangents that move, b of the normal, if that approaches.
         """
-        c, out, is_edge = self.cones, np.full(self.m, np.nan, L), False
+        c = self.cones
+        out = np.full(self.m, np.nan, L)
+        is_edge = False
         tiny = L(2.0) ** -51 * np.abs(self.b).max(initial=ZERO)
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])
@@ -558,7 +596,8 @@ class Problem:
                 own[:] = np.sqrt(self.d[part][0] * (self.d[part] * error0[part] ** 2).sum())
                 terms[:] = terms.max()
             elif c["kind"][k] != ROW:
-                empty[1:], empty[0] = False, self.b[part][0] > 0
+                empty[1:] = False
+                empty[0] = self.b[part][0] > 0
                 own[0] = self.b[part][0]
             line = L(2.0) ** -48 * np.where(np.isfinite(terms), terms, ZERO)
             is_edge |= bool(np.any(empty & (line > 0) & (own > line / 16) & (own < 16 * line)))
@@ -569,7 +608,9 @@ class Problem:
 
     def _by_scale(self, rows, error, scale):
         """Largest error of the rows of an island over their scale, of a contact all rows together."""
-        ptr, kind, worst = self.cones["ptr"], self.cones["kind"], ZERO
+        ptr = self.cones["ptr"]
+        kind = self.cones["kind"]
+        worst = ZERO
         for k in range(len(kind)):
             part = slice(ptr[k], ptr[k + 1])
             if not rows[ptr[k]]:
@@ -620,7 +661,9 @@ class Problem:
 
         Without b over the terms of b, and without these over 2^-51 of E0 of all rows.
         """
-        ptr, kind, worst = self.cones["ptr"], self.cones["kind"], ZERO
+        ptr = self.cones["ptr"]
+        kind = self.cones["kind"]
+        worst = ZERO
         for k in range(len(kind)):
             part = slice(ptr[k], ptr[k + 1])
             if not rows[ptr[k]]:
@@ -628,7 +671,8 @@ class Problem:
             size = np.sqrt(self.d[part]) * np.abs(error[part])
             own = np.where(self.b[part] != 0, np.abs(self.b[part]), self.terms[part]) / np.sqrt(self.d[part])
             if kind[k] != ROW:
-                size, own = np.sqrt((size**2).sum())[None], own[:1]
+                size = np.sqrt((size**2).sum())[None]
+                own = own[:1]
             for x, y in zip(size, np.where(own > 0, own, 4 * U * whole), strict=True):
                 worst = max(worst, ZERO if x == 0 else x / y if y > 0 else L(np.inf))
         return worst
@@ -661,7 +705,8 @@ class Problem:
     def _rounds(self, y, z, share):
         """(m,) where rounding of the data by `share` explains A^T y: of A by its rows, of J as a whole; never of R."""
         length = np.sqrt(self.d)
-        size, least = length @ np.abs(y), ZERO
+        size = length @ np.abs(y)
+        least = ZERO
         if self.operator == "matrix":
             return np.abs(z) <= share * length * size
         if self.operator == "general":
@@ -696,10 +741,12 @@ class Problem:
             return "not finite numbers"
         y /= self.stretch
         c = self.cones
-        gain, most = self.b @ y, np.abs(self.b) @ np.abs(y)
+        gain = self.b @ y
+        most = np.abs(self.b) @ np.abs(y)
         if not gain > 0:
             return "b.y is not positive"
-        z, share = self.A.T @ y, min(L(4.0) * (self.m + 2) * U, L(1e-9) * gain / most)
+        z = self.A.T @ y
+        share = min(L(4.0) * (self.m + 2) * U, L(1e-9) * gain / most)
         z = np.where(self._rounds(y, z, share), ZERO, z)
         pull = ZERO
         for k in range(len(c["kind"])):
@@ -708,7 +755,8 @@ class Problem:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
                 if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
                     return "y leaves the bounds"
-                low, high = np.maximum(low, -LARGEST), np.minimum(high, LARGEST)
+                low = np.maximum(low, -LARGEST)
+                high = np.minimum(high, LARGEST)
                 pull += sum(x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0)
                 continue
             yk, zk = y[part], z[part]
@@ -728,10 +776,14 @@ class Problem:
 
 def sweep(problem, twin, lam, blocks):
     """One sweep over blocks under Coulomb's law, in place; A, d and bounds are those of the judge's twin."""
-    c, s, (a, b, d) = problem.cones, twin.stretch, (x.astype(float) for x in (twin.A, twin.b, twin.d))
-    given, lam = lam, lam / s
+    c = problem.cones
+    s = twin.stretch
+    (a, b, d) = (x.astype(float) for x in (twin.A, twin.b, twin.d))
+    given = lam
+    lam = lam / s
     for i in blocks:
-        j, end = c.ptr[i], c.ptr[i + 1]
+        j = c.ptr[i]
+        end = c.ptr[i + 1]
         if c.kind[i] == ROW:
             for q in range(j, end):
                 lam[q] = np.clip(lam[q] - (a[q] @ lam - b[q]) / d[q], c.lower[q], c.upper[q])

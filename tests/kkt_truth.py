@@ -23,7 +23,8 @@ def eliminate(t, columns):
 
 def parts(c, i, number=float):
     """(rows, most of their norm over the normal impulse) of all that a contact bounds by itself."""
-    mu, first = number(c.mu[i]), c.ptr[i] + 1
+    mu = number(c.mu[i])
+    first = c.ptr[i] + 1
     found = [(np.arange(first, first + c.n_together[i]), mu)] if c.n_together[i] else []
     if c.separate_rows[i] >= 0:  # spin, or the other side of a box
         found.append((c.separate_rows[i : i + 1], mu * number(c.patch_radius[i])))
@@ -37,8 +38,11 @@ OF_PROGRAM = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 
 def of_program(qp, answer):
     """(primal, dual, gap) of min 1/2 x.P x + q.x, G x <= h, A x = b, lb <= x <= ub, from the arrays as given."""
-    x, force = answer.x, qp["P"] @ answer.x + qp["q"]
-    short, wrong, value = [0.0], [0.0], x @ force
+    x = answer.x
+    force = qp["P"] @ answer.x + qp["q"]
+    short = [0.0]
+    wrong = [0.0]
+    value = x @ force
     if qp["A"] is not None:
         force = force + qp["A"].T @ answer.y
         short.append(np.abs(qp["A"] @ x - qp["b"]).max(initial=0.0))
@@ -67,11 +71,17 @@ def relative_of_program(qp, answer):
 
     And |objective| over the sum of its terms' sizes, which says how far they cancel.
     """
-    x, px, y = answer.x, qp["P"] @ answer.x, [np.zeros(0)]
+    x = answer.x
+    px = qp["P"] @ answer.x
+    y = [np.zeros(0)]
     dense = {k: np.zeros((0, len(x))) if qp[k] is None else np.asarray(qp[k]) for k in ("G", "A")}
     rows = [(dense["A"], qp["b"], answer.y), (dense["G"], qp["h"], answer.z)]
-    short, size, force, forces = [0.0], [1e-300], px + qp["q"], [np.abs(px).max(), np.abs(qp["q"]).max()]
-    value, terms = x @ (px + qp["q"]), np.abs(x) @ (np.abs(px) + np.abs(qp["q"]))
+    short = [0.0]
+    size = [1e-300]
+    force = px + qp["q"]
+    forces = [np.abs(px).max(), np.abs(qp["q"]).max()]
+    value = x @ (px + qp["q"])
+    terms = np.abs(x) @ (np.abs(px) + np.abs(qp["q"]))
     for (matrix, side, y), is_equation in zip(rows, (True, False), strict=True):
         if side is None:
             continue
@@ -81,7 +91,8 @@ def relative_of_program(qp, answer):
         size.extend(np.abs(side[on]))
         size.extend(np.abs(matrix[on] @ x))
         pull = matrix.T @ y
-        force, value = force + pull, value + side[on] @ y[on]
+        force = force + pull
+        value = value + side[on] @ y[on]
         terms += np.abs(side[on]) @ np.abs(y[on])
         forces.append(np.abs(pull).max())
     if answer.z_box is not None:

@@ -17,7 +17,10 @@ class NewtonSteps:
         scene = lv.Scene(name, solver="newton", warm_start=warm_start, solver_iterations=16, **parameters)
         self.simulation = lv.Simulation(scene)
         self.substeps = scene.parameters.substeps
-        self.tol, self.ended, self.told, self.trace = tol, [], None, None
+        self.tol = tol
+        self.ended = []
+        self.told = None
+        self.trace = None
         self._take(self.simulation.state)
 
     def _take(self, state):

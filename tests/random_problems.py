@@ -59,11 +59,18 @@ def random_bodies_and_contacts(rng, bodies=5, joints=3, contacts=8):
     tangent = np.array([np.cross(n, unit(rng)) for n in normal]).reshape(-1, 3)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return Rows(
-        inv_mass=1.0 / mass, inv_inertia=np.array(inertia), v_free=rng.normal(size=(bodies, 6)), jac=jac, joint_ptr=ptr,
-        joint_body=joint_body, normal=normal, tangent=tangent, arm_a=rng.normal(size=(contacts, 3)) * 0.5,
+        inv_mass=1.0 / mass,
+        inv_inertia=np.array(inertia),
+        v_free=rng.normal(size=(bodies, 6)),
+        jac=jac,
+        joint_ptr=ptr,
+        joint_body=joint_body,
+        normal=normal,
+        tangent=tangent,
+        arm_a=rng.normal(size=(contacts, 3)) * 0.5,
         arm_b=rng.normal(size=(contacts, 3)) * 0.5,
         contact_body=np.array([draw_pair() for _ in range(contacts)], np.int32).reshape(-1, 2),
-    )  # fmt: skip
+    )
 
 
 def touching(contact_body, **fields):
@@ -72,12 +79,18 @@ def touching(contact_body, **fields):
     `fields` replaces fields of the resulting `Rows`.
     """
     body = np.reshape(contact_body, (-1, 2)).astype(np.int32)
-    c, n = len(body), len(fields.get("inv_mass", range(body.max(initial=-1) + 1)))
+    c = len(body)
+    n = len(fields.get("inv_mass", range(body.max(initial=-1) + 1)))
     defaults = {
-        "inv_mass": np.ones(n), "inv_inertia": np.tile(np.eye(3), (n, 1, 1)), "v_free": np.zeros((n, 6)),
-        "normal": np.tile([0.0, 0.0, 1.0], (c, 1)), "tangent": np.tile([1.0, 0.0, 0.0], (c, 1)),
-        "arm_a": np.zeros((c, 3)), "arm_b": np.zeros((c, 3)), "contact_body": body,
-    }  # fmt: skip
+        "inv_mass": np.ones(n),
+        "inv_inertia": np.tile(np.eye(3), (n, 1, 1)),
+        "v_free": np.zeros((n, 6)),
+        "normal": np.tile([0.0, 0.0, 1.0], (c, 1)),
+        "tangent": np.tile([1.0, 0.0, 0.0], (c, 1)),
+        "arm_a": np.zeros((c, 3)),
+        "arm_b": np.zeros((c, 3)),
+        "contact_body": body,
+    }
     return Rows(**defaults | fields)
 
 
@@ -90,19 +103,26 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, r
     rng = np.random.default_rng(seed)
     rows = random_bodies_and_contacts(rng, **sizes)
     count = 2 if rolling else tangents
-    c, mj = rows.n_contacts, len(rows.jac)
+    c = rows.n_contacts
+    mj = len(rows.jac)
     if count is None:
         count = rng.integers(0, 3, c)
     bounded = rng.random(mj) < 0.4
     high = np.where(bounded, rng.uniform(0.0, 0.5, mj), np.inf)
     m = mj + int(np.sum(np.broadcast_to(count, c))) + c * (1 + spin + 2 * rolling)
     return Problem.from_rows(
-        rows, target=rng.normal(size=m) * 0.1, lower=-high, upper=high,
-        mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(count, c) > 0 if not spin else 1.0), tangents=count,
+        rows,
+        target=rng.normal(size=m) * 0.1,
+        lower=-high,
+        upper=high,
+        mu=rng.uniform(0.0, 1.2, c) * (np.broadcast_to(count, c) > 0 if not spin else 1.0),
+        tangents=count,
         patch_radius=rng.uniform(0.0, 0.4, c) if spin else None,
-        rolling=rng.uniform(0.0, 0.3, c) * (rng.random(c) < 0.8) if rolling else None, friction=friction,
-        compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5), name=f"random {seed}",
-    )  # fmt: skip
+        rolling=rng.uniform(0.0, 0.3, c) * (rng.random(c) < 0.8) if rolling else None,
+        friction=friction,
+        compliance=rng.uniform(0.0, 0.2, m) * (rng.random(m) < 0.5),
+        name=f"random {seed}",
+    )
 
 
 def as_matrix(problem):
@@ -115,17 +135,24 @@ def as_matrix(problem):
 def general(problem):
     """Return the same problem of bodies as J and M."""
     assert problem.rows is not None
-    minv, free = problem.rows.inverse_mass_matrix().toarray(), problem.rows.v_free.ravel()
+    minv = problem.rows.inverse_mass_matrix().toarray()
+    free = problem.rows.v_free.ravel()
     return Problem.from_jacobian(
-        problem.jacobian, np.linalg.inv(minv), free, target=problem.b + problem.jacobian @ free,
-        cones=problem.cones, compliance=problem.compliance, friction=problem.friction,
-    )  # fmt: skip
+        problem.jacobian,
+        np.linalg.inv(minv),
+        free,
+        target=problem.b + problem.jacobian @ free,
+        cones=problem.cones,
+        compliance=problem.compliance,
+        friction=problem.friction,
+    )
 
 
 def random_box_friction_contacts(seed, friction="coulomb", **sizes):
     """Draw joints, and contacts that bound each tangent separately; most have two coefficients."""
     base = random_contact_problem(seed, friction, tangents=2, spin=False, **sizes)
-    c, rng = base.cones.shaped("box"), np.random.default_rng(seed + 7)
+    c = base.cones.shaped("box")
+    rng = np.random.default_rng(seed + 7)
     radius = np.where(c.kind == CONTACT_BOX, rng.uniform(0.2, 3.0, c.n_blocks), 0.0)
     return replace(base, cones=replace(c, patch_radius=radius))
 
@@ -150,8 +177,10 @@ CONTACTS = {
 }
 #: Kind of contact -> function (mu (n,), arms [m] or second coefficients (n,)) that makes the cones of n such contacts.
 CONES = {
-    "normal": lambda mu, arm: Cones.contacts(0.0 * mu, 0), "one tangent": lambda mu, arm: Cones.contacts(mu, 1),
-    "disk": lambda mu, arm: Cones.contacts(mu), "spin alone": lambda mu, arm: Cones.contacts(mu, 0, arm),
+    "normal": lambda mu, arm: Cones.contacts(0.0 * mu, 0),
+    "one tangent": lambda mu, arm: Cones.contacts(mu, 1),
+    "disk": lambda mu, arm: Cones.contacts(mu),
+    "spin alone": lambda mu, arm: Cones.contacts(mu, 0, arm),
     "one tangent and spin": lambda mu, arm: Cones.contacts(mu, 1, arm),
     "spin": lambda mu, arm: Cones.contacts(mu, patch_radius=arm),
     "box": lambda mu, arm: Cones.contacts(np.stack([mu, 2.0 * arm], 1), shape="box"),
@@ -159,7 +188,7 @@ CONES = {
     "rolling": lambda mu, arm: Cones.contacts(mu, rolling=arm),
     "rolling and spin": lambda mu, arm: Cones.contacts(mu, patch_radius=0.2 + 0.0 * mu, rolling=arm),
     "round": lambda mu, arm: Cones.contacts(mu, 5),
-}  # fmt: skip
+}
 
 
 def make_problem_with_other_numbers(problem):
@@ -233,9 +262,15 @@ def random_generalized_problem(seed, friction="cone", n=14, compliance=True, con
     margin = np.zeros(m)
     margin[2:][cones.lower[2:] == 0.0] = 0.5
     return Problem.from_jacobian(
-        jac, tree_mass(rng, parent), rng.normal(size=n), target=jac @ rng.normal(size=n) - margin, cones=cones,
-        compliance=soft, friction=friction, name=f"general {seed}",
-    )  # fmt: skip
+        jac,
+        tree_mass(rng, parent),
+        rng.normal(size=n),
+        target=jac @ rng.normal(size=n) - margin,
+        cones=cones,
+        compliance=soft,
+        friction=friction,
+        name=f"general {seed}",
+    )
 
 
 # -- problems of every law and kind of block --------------------------------------------------------
@@ -297,13 +332,15 @@ def side_by_side(parts):
     cones = parts[0].cones
     for part in parts[1:]:
         cones = cones + part.cones
-    b, a = (np.concatenate([part.b for part in parts]), sp.block_diag([part.csr for part in parts], format="csr"))
+    b = np.concatenate([part.b for part in parts])
+    a = sp.block_diag([part.csr for part in parts], format="csr")
     return lv.Problem(b, cones, a, friction=parts[0].friction)
 
 
 def with_ground_as_body(problem):
     """Return the problem of bodies with its static body, -1, given as one more body of inverse mass and inertia 0."""
-    rows, n = problem.rows, problem.rows.n_bodies
+    rows = problem.rows
+    n = problem.rows.n_bodies
     ground = {
         "inv_mass": np.append(rows.inv_mass, 0.0),
         "inv_inertia": np.concatenate([rows.inv_inertia, np.zeros((1, 3, 3))]),
@@ -325,7 +362,8 @@ seeds = st.integers(0, 2**32 - 1)
 def dragged(seed, contacts, mu=None, shape="disk", friction="coulomb"):
     """J and M of contacts alone, pressed on and dragged; two coefficients each are drawn where none are given."""
     rng = np.random.default_rng(seed)
-    m, nv = 3 * contacts, 3 * contacts + 3
+    m = 3 * contacts
+    nv = 3 * contacts + 3
     mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
     target = rng.normal(size=m)
     target[::3] += 1.0
@@ -362,7 +400,8 @@ def sweeps(problem, name, n, **options):
 
 def warmed(problem, seed):
     """Targets that are a little different, from the answer; None where there is none."""
-    solution, rng = lv.solve(problem, tol=1e-9), np.random.default_rng(seed)
+    solution = lv.solve(problem, tol=1e-9)
+    rng = np.random.default_rng(seed)
     b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
     return problem.updated(b=b, guess=solution.impulse) if solution.success else None
 

@@ -56,7 +56,8 @@ def load(file, model, changes):
 def make_kamino(model, **changes):
     """Return a SolverKamino: "mixed" worlds and "stacks" by PADMM, or by "dvi"; `record_kamino.py` recorded them."""
     solver = load("kamino_1.8.0.npz", model, changes)
-    engine, is_dvi = solver._solver_kamino, model == "dvi"
+    engine = solver._solver_kamino
+    is_dvi = model == "dvi"
     engine._config = SimpleNamespace(
         dynamics_solver="dvi" if is_dvi else "padmm", sparse_jacobian=is_dvi, sparse_dynamics=False
     )
@@ -71,7 +72,8 @@ class LegacyCoupler:
 def make_genesis(model, **changes):
     """Return a built scene of three environments: "arm", "convex" or "pyramids"; `record_genesis.py` recorded them."""
     made = load("genesis_1.4.5.npz", model, changes)
-    made.is_built, made.sim.coupler = True, LegacyCoupler()
+    made.is_built = True
+    made.sim.coupler = LegacyCoupler()
     solver = made.sim.rigid_solver
     solver._options = SimpleNamespace(noslip_iterations=0)
     solver.rigid_config.enable_mujoco_compatibility = False
@@ -92,7 +94,8 @@ def replace_genesis(monkeypatch):
 def make_newton_mujoco(cone="elliptic", n=3, **changes):
     """Return a SolverMuJoCo of newton with the arrays of n states of MuJoCo, padded, in float32."""
     model = mj.MjModel.from_xml_string(scene(cone=cone))
-    rng, worlds = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    worlds = []
     efc = {name: [] for name in ("J", "D", "aref", "type", "frictionloss", "force")}
     contact = {name: [] for name in ("worldid", "efc_address", "dim", "friction")}
     rest = {name: [] for name in ("qacc_smooth", "qfrc_smooth", "qacc", "M", "qvel")}
@@ -119,8 +122,12 @@ def make_newton_mujoco(cone="elliptic", n=3, **changes):
     others = {k: np.array(v, np.float32) for k, v in rest.items()}
     others = {k: Recorded(changes.get(k, lambda x: x)(x)) for k, x in others.items()}
     data = SimpleNamespace(
-        nefc=Recorded(np.array(worlds, np.int32)), nacon=Recorded([len(contacts["dim"])]),
-        efc=SimpleNamespace(**arrays), contact=SimpleNamespace(**contacts), solver_niter=Recorded([2] * n), **others,
-    )  # fmt: skip
+        nefc=Recorded(np.array(worlds, np.int32)),
+        nacon=Recorded([len(contacts["dim"])]),
+        efc=SimpleNamespace(**arrays),
+        contact=SimpleNamespace(**contacts),
+        solver_niter=Recorded([2] * n),
+        **others,
+    )
     option = SimpleNamespace(timestep=Recorded([model.opt.timestep]), iterations=100)
     return SimpleNamespace(mjw_data=data, mj_model=model, mjw_model=SimpleNamespace(opt=option))

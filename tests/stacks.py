@@ -38,18 +38,24 @@ def bricks(layers, noise, seed=0):
     for upper in range(3 * layers):
         for lower in range(3 * layer[upper] - 3, 3 * layer[upper]) if layer[upper] else [-1]:
             on = [upper] if lower < 0 else [upper, lower]
-            low, high = (place[on] - half[on]).max(axis=0), (place[on] + half[on]).min(axis=0)
+            low = (place[on] - half[on]).max(axis=0)
+            high = (place[on] + half[on]).min(axis=0)
             body += 4 * [(lower, upper)]
             corner += [(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])]
-    pair, point, k = np.array(body, np.int32), np.array(corner), len(body)
+    pair = np.array(body, np.int32)
+    point = np.array(corner)
+    k = len(body)
     centre = np.column_stack([place, np.zeros(3 * layers)])
     rows = lv.Rows(
-        inv_mass=1.0 / mass, inv_inertia=(3.0 / (mass[:, None] * squares))[:, :, None] * np.eye(3),
-        v_free=2e-3 * rng.normal(size=(3 * layers, 6)) - [0.0, 0.0, 9.81 * 2e-3, 0.0, 0.0, 0.0], contact_body=pair,
-        normal=np.tile([0.0, 0.0, 1.0], (k, 1)), tangent=np.tile([1.0, 0.0, 0.0], (k, 1)),
+        inv_mass=1.0 / mass,
+        inv_inertia=(3.0 / (mass[:, None] * squares))[:, :, None] * np.eye(3),
+        v_free=2e-3 * rng.normal(size=(3 * layers, 6)) - [0.0, 0.0, 9.81 * 2e-3, 0.0, 0.0, 0.0],
+        contact_body=pair,
+        normal=np.tile([0.0, 0.0, 1.0], (k, 1)),
+        tangent=np.tile([1.0, 0.0, 0.0], (k, 1)),
         arm_a=np.where(pair[:, :1] >= 0, point - centre[pair[:, 0]] + [0.0, 0.0, 0.015], 0.0),
         arm_b=point - centre[pair[:, 1]] - [0.0, 0.0, 0.015],
-    )  # fmt: skip
+    )
     target = np.zeros((k, 3))
     target[:, 0] = noise * rng.normal(size=k)
     return lv.Problem.from_rows(rows, target=target.ravel(), mu=0.5)

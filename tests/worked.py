@@ -49,7 +49,8 @@ def after(steps, scene, **parameters):
 
 def energy(scene, observation):
     """Kinetic and potential energy [J] of what moves."""
-    total, g = 0.0, np.array(scene.parameters.gravity)
+    total = 0.0
+    g = np.array(scene.parameters.gravity)
     seen = (observation[key] for key in ("positions", "quaternions", "velocities"))
     for body, x, q, v in zip(scene.bodies, *seen, strict=True):
         if not body.is_static:

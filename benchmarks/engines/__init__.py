@@ -15,7 +15,10 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
 
-PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # Engine -> npm package.
+PACKAGES_OF_NODE = {
+    "rapier": "@dimforge/rapier3d-compat",
+    "jolt": "jolt-physics",
+}  # Engine -> npm package.
 
 
 class Stepping:
@@ -55,7 +58,9 @@ class Stepping:
 
 def create_engine(module: str, scene: Scene, **options: Any) -> Stepping:
     """Create the engine of a file of this folder with a scene."""
-    created: Stepping = importlib.import_module(f"benchmarks.engines.{module}").Engine(scene, **options)
+    created: Stepping = importlib.import_module(f"benchmarks.engines.{module}").Engine(
+        scene, **options
+    )
     return created
 
 
@@ -100,7 +105,9 @@ def find_node_folder(package: str) -> Path | None:
 
 def get_npm_versions() -> dict[str, str]:
     """Return the version of each npm package that is installed."""
-    folders = {name: folder for name in PACKAGES_OF_NODE.values() if (folder := find_node_folder(name))}
+    folders = {
+        name: folder for name in PACKAGES_OF_NODE.values() if (folder := find_node_folder(name))
+    }
     return {
         name: str(json.loads((folder / "package.json").read_text(encoding="utf-8"))["version"])
         for name, folder in folders.items()

@@ -11,7 +11,11 @@ from lavender.sim.scene import Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import convert_frame_to_quaternion
 from lavender.sim.scene.parts import convert_to_rotation_matrix
 
-GROUND_BOX_SIZE = (200.0, 20.0, 200.0)  # [m] Size of the box that replaces a plane; its second axis is up.
+GROUND_BOX_SIZE = (
+    200.0,
+    20.0,
+    200.0,
+)  # [m] Size of the box that replaces a plane; its second axis is up.
 
 
 def _make_engine_axes(up: FloatArray) -> FloatArray:
@@ -34,12 +38,17 @@ class Engine(Stepping):
         size = float(np.linalg.norm(g))
         self.frame = _make_engine_axes(-g / size if size else np.array([0.0, 0.0, 1.0]))
         self.material = {
-            "static_friction": p.friction, "dynamic_friction": p.friction, "restitution": 0.0,
-            "torsional_friction": p.friction if p.patch_radius else 0.0, "contact_radius": p.patch_radius or 0.02,
+            "static_friction": p.friction,
+            "dynamic_friction": p.friction,
+            "restitution": 0.0,
+            "torsional_friction": p.friction if p.patch_radius else 0.0,
+            "contact_radius": p.patch_radius or 0.02,
             # The engine multiplies the coefficient of rolling friction by the contact radius.
             "rolling_friction": p.rolling_radius / (p.patch_radius or 0.02),
-        }  # fmt: skip
-        engine_scene = lavendersim.Scene("scene", gravity=-size, solver_iterations=sweeps, ground=False)
+        }
+        engine_scene = lavendersim.Scene(
+            "scene", gravity=-size, solver_iterations=sweeps, ground=False
+        )
         for i in range(scene.n_bodies):
             self._add_body(engine_scene, i)
         self.env = lavendersim.CodeSceneEnv(engine_scene, control_dt=self.dt, horizon=None)
@@ -64,12 +73,18 @@ class Engine(Stepping):
                 **self.material,
             )
             return
-        orientation = convert_frame_to_quaternion(self.frame @ convert_to_rotation_matrix(body.quaternion))
+        orientation = convert_frame_to_quaternion(
+            self.frame @ convert_to_rotation_matrix(body.quaternion)
+        )
         body_options = {
-            "mass": body.mass, "position": self.frame @ body.position, "rotation": np.roll(orientation, -1),
-            "linear_velocity": self.frame @ body.velocity, "collision": True,
-            "angular_velocity": self.frame @ body.angular_velocity, **self.material,
-        }  # fmt: skip
+            "mass": body.mass,
+            "position": self.frame @ body.position,
+            "rotation": np.roll(orientation, -1),
+            "linear_velocity": self.frame @ body.velocity,
+            "collision": True,
+            "angular_velocity": self.frame @ body.angular_velocity,
+            **self.material,
+        }
         if isinstance(shape, Sphere):
             engine_scene.sphere(f"b{i}", radius=shape.radius, **body_options)
         else:
@@ -81,11 +96,17 @@ class Engine(Stepping):
         inverse_frame = self.frame.T
         q = np.array(
             [
-                convert_frame_to_quaternion(inverse_frame @ convert_to_rotation_matrix(np.roll(row[3:7], 1)))
+                convert_frame_to_quaternion(
+                    inverse_frame @ convert_to_rotation_matrix(np.roll(row[3:7], 1))
+                )
                 for row in s
             ]
         )
-        return s[:, :3] @ self.frame, q, np.hstack([s[:, 7:10] @ self.frame, s[:, 10:13] @ self.frame])
+        return (
+            s[:, :3] @ self.frame,
+            q,
+            np.hstack([s[:, 7:10] @ self.frame, s[:, 10:13] @ self.frame]),
+        )
 
     def close(self) -> None:
         """See `Stepping.close`."""

@@ -51,13 +51,16 @@ class Engine(Stepping):
         self.data = mujoco.MjData(self.model)
         self.dt = float(self.model.opt.timestep)
         self.ids = [
-            mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}") for i in range(scene.n_bodies)
+            mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}")
+            for i in range(scene.n_bodies)
         ]
         for i, body in enumerate(scene.bodies):
             if not body.is_static:
                 at = self.model.jnt_dofadr[self.model.body_jntadr[self.ids[i]]]
                 # The angular velocity of a free joint is in the body's frame.
-                angular_velocity = convert_to_rotation_matrix(body.quaternion).T @ body.angular_velocity
+                angular_velocity = (
+                    convert_to_rotation_matrix(body.quaternion).T @ body.angular_velocity
+                )
                 self.data.qvel[at : at + 6] = np.concatenate([body.velocity, angular_velocity])
         mujoco.mj_forward(self.model, self.data)
 
@@ -93,15 +96,22 @@ class Engine(Stepping):
         depth = max(0.0, -float(d.contact.dist[: d.ncon].min())) if d.ncon else 0.0
         if self.scene.joints:
             depth = float(np.abs(d.efc_pos[: d.nefc]).max(initial=0.0))
-        return int(d.ncon), depth, residual(self.read_last_problem(), impulse(self.model, d)).relative
+        return (
+            int(d.ncon),
+            depth,
+            residual(self.read_last_problem(), impulse(self.model, d)).relative,
+        )
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.get_state`; velocities are evaluated at the same time as the poses."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_comVel(self.model, self.data)
-        v, body_velocity = np.zeros((len(self.ids), 6)), np.zeros(6)
+        v = np.zeros((len(self.ids), 6))
+        body_velocity = np.zeros(6)
         for k, i in enumerate(self.ids):
-            mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, i, body_velocity, 0)
+            mujoco.mj_objectVelocity(
+                self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, i, body_velocity, 0
+            )
             v[k] = np.roll(body_velocity, 3)  # MuJoCo returns the angular velocity first.
         return self.data.xpos[self.ids].copy(), self.data.xquat[self.ids].copy(), v

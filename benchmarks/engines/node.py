@@ -35,7 +35,12 @@ class JsonLines:
     def __init__(self, command: Sequence[str], cwd: Path | None = None) -> None:
         self._name = command[0]
         self._process = subprocess.Popen(
-            command, cwd=cwd, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+            command,
+            cwd=cwd,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
         )
 
     def request_answer(self, message: Any) -> Any:
@@ -67,7 +72,8 @@ class Engine(Stepping):
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
         reject_joints(scene, engine)
-        self.dt, self.cpu_time = dt, 0.0
+        self.dt = dt
+        self.cpu_time = 0.0
         p = scene.parameters
         request = {
             "gravity": list(p.gravity),
@@ -76,7 +82,9 @@ class Engine(Stepping):
         }
         folder = find_node_folder(PACKAGES_OF_NODE[engine])
         if folder is None:
-            raise LavenderError(f"{engine}: {explain_missing_npm_package(PACKAGES_OF_NODE[engine])}")
+            raise LavenderError(
+                f"{engine}: {explain_missing_npm_package(PACKAGES_OF_NODE[engine])}"
+            )
         self.program = JsonLines(["node", str(SCRIPT), engine, str(folder)])
         self._request_answer({"scene": request, "options": {"dt": self.dt, **options}})
         self.cpu_time = 0.0
@@ -117,7 +125,11 @@ def _describe_body(body: Body, engine: str) -> dict[str, Any]:
     """Build the JSON description of a body."""
     shape = get_collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
-        shape_data: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
+        shape_data: dict[str, Any] = {
+            "kind": "plane",
+            "normal": list(shape.normal),
+            "offset": shape.offset,
+        }
     elif isinstance(shape, Sphere):
         shape_data = {"kind": "sphere", "radius": shape.radius}
     else:

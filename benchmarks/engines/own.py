@@ -14,7 +14,8 @@ class Engine(Stepping):
     """Engine that steps a scene with `Simulation.step`."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.sim = scene, Simulation(scene)
+        self.scene = scene
+        self.sim = Simulation(scene)
         self.dt = scene.parameters.dt
         self.observation = self.sim.reset()[0]
         self.has_ended = False
@@ -26,10 +27,18 @@ class Engine(Stepping):
 
     def get_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.get_state`."""
-        return self.observation["positions"], self.observation["quaternions"], self.observation["velocities"]
+        return (
+            self.observation["positions"],
+            self.observation["quaternions"],
+            self.observation["velocities"],
+        )
 
     def measure_last_step(self) -> tuple[int, float, float]:
         """See `Stepping.measure_last_step`."""
         gap = np.abs(self.sim.state.a["joint_error"]).max(initial=0.0)
         depth = max(self.observation["contacts"]["depth"].max(initial=0.0), gap)
-        return int(self.observation["solver"][2]), float(depth), float(self.sim.residual()["relative"])
+        return (
+            int(self.observation["solver"][2]),
+            float(depth),
+            float(self.sim.residual()["relative"]),
+        )

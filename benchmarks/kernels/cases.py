@@ -83,7 +83,9 @@ class Job:
 _ADD = 64  # sweeps after which the iterate no longer changes; timing starts there
 
 
-def sweeps(problem: Problem, name: str, n: int, **options: Any) -> tuple[Callable[[], Any], FloatArray]:
+def sweeps(
+    problem: Problem, name: str, n: int, **options: Any
+) -> tuple[Callable[[], Any], FloatArray]:
     """Return a call of n more sweeps of a prepared solver, and the impulses (m,) [N s] that it changes."""
     prepared = prepare(problem, name, **options)
     lam = problem.start()
@@ -147,9 +149,13 @@ def _block_sweep(contacts: int) -> Job:
     n = _count(100 * c)
     call, lam = sweeps(problem, "block_gauss_seidel", n)
     return Job(
-        "block_gauss_seidel", f"{c} contacts", "contact", n * c, call,
+        "block_gauss_seidel",
+        f"{c} contacts",
+        "contact",
+        n * c,
+        call,
         relative=lambda: residual(problem, lam).relative,
-    )  # fmt: skip
+    )
 
 
 def _small() -> Job:
@@ -212,13 +218,21 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     size = f"{scene}, {bodies} bodies"
     phases = (
         ("pairs", "body", bodies, best["pairs"]),
-        ("collide, match, rows", "contact", contacts, max(best["prepare"], best["again"]) - best["pairs"]),
+        (
+            "collide, match, rows",
+            "contact",
+            contacts,
+            max(best["prepare"], best["again"]) - best["pairs"],
+        ),
         ("16 sweeps", "contact and sweep", 16 * contacts, best["solve"] - best["warm"]),
         ("integrate, project", "body", bodies, best["finish"]),
     )
     step = least(simulation.step, seconds=seconds)[0]
     return [
-        *(Row(f"engine: {name}", size, unit, work, max(time, 1e-9)) for name, unit, work, time in phases),
+        *(
+            Row(f"engine: {name}", size, unit, work, max(time, 1e-9))
+            for name, unit, work, time in phases
+        ),
         Row("sim.step(), 16 sweeps", size, "step", 1, step, residual=relative),
     ]
 

@@ -19,7 +19,17 @@ def _number(x: float, form: str = "{:.3g}") -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """Return the rows as a markdown table."""
-    head = ("case", "size", "time", "unit", "ns / unit", "instructions / unit", "beside", "share", "residual")
+    head = (
+        "case",
+        "size",
+        "time",
+        "unit",
+        "ns / unit",
+        "instructions / unit",
+        "beside",
+        "share",
+        "residual",
+    )
     cells = []
     for r in rows:
         micro = 1e6 * r.seconds
@@ -27,10 +37,17 @@ def table(rows: Sequence[Row]) -> str:
         beside = r.beside and f"{r.beside} {1e9 * r.limit / r.work:.3g} ns"
         cells.append(
             (
-                r.case, r.size, time, r.unit, f"{r.per_unit:.3g}", _number(r.instructions), beside,
-                _number(r.share, "{:.2f}"), _number(r.residual, "{:.1e}"),
+                r.case,
+                r.size,
+                time,
+                r.unit,
+                f"{r.per_unit:.3g}",
+                _number(r.instructions),
+                beside,
+                _number(r.share, "{:.2f}"),
+                _number(r.residual, "{:.1e}"),
             )
-        )  # fmt: skip
+        )
     return markdown(head, cells)
 
 
@@ -38,7 +55,10 @@ def table(rows: Sequence[Row]) -> str:
 @click.argument("cases", nargs=-1, metavar="[CASES]...")
 @click.option("--seconds", default=0.2, show_default=True, metavar="S", help="Time for each case.")
 @click.option(
-    "--instructions", "count", is_flag=True, help="Count instructions by valgrind's callgrind, minutes."
+    "--instructions",
+    "count",
+    is_flag=True,
+    help="Count instructions by valgrind's callgrind, minutes.",
 )
 def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
     """Measure kernels and small calls alternately with bare loops of the same mathematics.

@@ -36,9 +36,13 @@ def instructions(name: str, calls: int = 10) -> float:
         The case is not in `COUNTED`, or valgrind failed.
     """
     if name not in COUNTED:
-        raise InputError(f"instructions of {name!r} are not counted; of {', '.join(COUNTED)} they are")
+        raise InputError(
+            f"instructions of {name!r} are not counted; of {', '.join(COUNTED)} they are"
+        )
     if shutil.which("valgrind") is None:
-        raise SolverUnavailable("counting instructions needs valgrind (Debian: apt install valgrind)")
+        raise SolverUnavailable(
+            "counting instructions needs valgrind (Debian: apt install valgrind)"
+        )
     one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
     totals = []
     with tempfile.TemporaryDirectory() as folder:
@@ -46,15 +50,21 @@ def instructions(name: str, calls: int = 10) -> float:
             out = Path(folder, f"{n}.out")
             done = subprocess.run(
                 [
-                    "valgrind", "--tool=callgrind", f"--callgrind-out-file={out}",
-                    sys.executable, "-c", _COUNT, name, str(n),
+                    "valgrind",
+                    "--tool=callgrind",
+                    f"--callgrind-out-file={out}",
+                    sys.executable,
+                    "-c",
+                    _COUNT,
+                    name,
+                    str(n),
                 ],
                 capture_output=True,
                 text=True,
                 check=False,
                 cwd=ROOT,
                 env={**os.environ, **one_thread},
-            )  # fmt: skip
+            )
             text = out.read_text() if out.exists() else ""
             found = re.search(r"^(?:summary|totals):\s*(\d+)", text, re.MULTILINE)
             if done.returncode or not found:

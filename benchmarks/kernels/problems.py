@@ -14,7 +14,9 @@ def tridiagonal(m: int) -> Problem:
     """Return a frictionless stack of m unit masses: 2 on the diagonal of A, -1 next to it."""
     import scipy.sparse as sp
 
-    a = sp.diags_array([np.full(m - 1, -1.0), np.full(m, 2.0), np.full(m - 1, -1.0)], offsets=[-1, 0, 1])
+    a = sp.diags_array(
+        [np.full(m - 1, -1.0), np.full(m, 2.0), np.full(m - 1, -1.0)], offsets=[-1, 0, 1]
+    )
     return Problem.lcp(sp.csr_array(a), np.full(m, 0.1))
 
 
@@ -25,10 +27,8 @@ def bare_contacts(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return contacts (two tangents) and bodies of a problem without joints as `microbenchmarks.contact` records."""
     rows, data = problem.rows, problem.data
     assert rows is not None
-    contacts, bodies = (
-        np.zeros(rows.n_contacts, microbenchmarks.CONTACT),
-        np.zeros(rows.n_bodies + 1, microbenchmarks.BODY),
-    )
+    contacts = np.zeros(rows.n_contacts, microbenchmarks.CONTACT)
+    bodies = np.zeros(rows.n_bodies + 1, microbenchmarks.BODY)
     contacts["body"] = rows.contact_body + 1
     for name in ("normal", "tangent", "arm_a", "arm_b"):
         contacts[name] = getattr(rows, name)

@@ -109,7 +109,9 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
 
         def once(eps: float) -> tuple[float, FloatArray]:
             begun = process_time()
-            with measure_backend_time(backend.name if own else "", process_time, setup=True) as spent:
+            with measure_backend_time(
+                backend.name if own else "", process_time, setup=True
+            ) as spent:
                 answer = backend.run(scaled, None, _limits(eps, backend.max_iter, limit), {})
             seconds = sum(spent) if own else process_time() - begun
             return seconds, _impulse(built, answer.x, answer.lam)
@@ -138,11 +140,10 @@ def _cone(name: str, form: str) -> Contestant:
         built = build_form(problem, form)
         scaled = built.program.scaled
         # A x + s = b: equations, inequalities with the bounds, cones.
-        rows, rhs = scaled.select_rows(np.arange(len(scaled.t)), -1.0, False), -scaled.t
-        upper, n_nonneg = (
-            sp.triu(scaled.get_hessian(False), format="csc"),
-            len(rhs) - scaled.free - sum(scaled.cones),
-        )
+        rows = scaled.select_rows(np.arange(len(scaled.t)), -1.0, False)
+        rhs = -scaled.t
+        upper = sp.triu(scaled.get_hessian(False), format="csc")
+        n_nonneg = len(rhs) - scaled.free - sum(scaled.cones)
 
         def scs(eps: float) -> tuple[Any, Any]:
             import scs
@@ -150,9 +151,15 @@ def _cone(name: str, form: str) -> Contestant:
             cone = {"z": scaled.free, "l": n_nonneg, "q": list(scaled.cones)}
             data = {"P": upper, "A": rows, "b": rhs, "c": scaled.q}
             found = scs.SCS(
-                data, cone, eps_abs=eps, eps_rel=0.0, eps_infeas=1e-14, max_iters=10**7,
-                time_limit_secs=limit, verbose=False,
-            ).solve()  # fmt: skip
+                data,
+                cone,
+                eps_abs=eps,
+                eps_rel=0.0,
+                eps_infeas=1e-14,
+                max_iters=10**7,
+                time_limit_secs=limit,
+                verbose=False,
+            ).solve()
             return found["x"], found["y"]
 
         def qoco(eps: float) -> tuple[Any, Any]:
@@ -162,12 +169,26 @@ def _cone(name: str, form: str) -> Contestant:
             solver = qoco.QOCO()
             equal = (rows[:z], rhs[:z]) if z else (None, None)
             solver.setup(
-                scaled.n, len(rhs) - z, z, upper, scaled.q, *equal, sp.csc_matrix(rows[z:]), rhs[z:], n_nonneg,
-                len(scaled.cones), np.asarray(scaled.cones, np.int32), abstol=max(eps, 1e-13), reltol=1e-16, verbose=0,
+                scaled.n,
+                len(rhs) - z,
+                z,
+                upper,
+                scaled.q,
+                *equal,
+                sp.csc_matrix(rows[z:]),
+                rhs[z:],
+                n_nonneg,
+                len(scaled.cones),
+                np.asarray(scaled.cones, np.int32),
+                abstol=max(eps, 1e-13),
+                reltol=1e-16,
+                verbose=0,
                 max_iters=200,
-            )  # fmt: skip
+            )
             found = solver.solve()
-            return np.asarray(found.x), np.concatenate([np.asarray(found.y)[:z], np.asarray(found.z)])
+            return np.asarray(found.x), np.concatenate(
+                [np.asarray(found.y)[:z], np.asarray(found.z)]
+            )
 
         def once(eps: float) -> tuple[float, FloatArray]:
             begun = process_time()
@@ -181,7 +202,9 @@ def _cone(name: str, form: str) -> Contestant:
     def refuses(problem: Problem) -> str | None:
         if problem.law != "cone":
             return "for the convex law of friction"
-        return "no rows" if form == "velocity" and problem.rows is None else explain_refusal(problem)
+        return (
+            "no rows" if form == "velocity" and problem.rows is None else explain_refusal(problem)
+        )
 
     return Contestant(f"{name} cones ({form})", True, runs, refuses)
 
@@ -203,10 +226,8 @@ def _pinocchio(lanczos: int | None) -> Contestant:
         m, c = problem.m, problem.n_blocks
         order = (np.arange(c)[:, None] * 3 + np.array([1, 2, 0])).ravel()
         # 1/kg, m/s
-        unit, speed = (
-            float(np.mean(problem.d)),
-            max(get_zero_impulse_reference(problem)[1], 1e-300),
-        )
+        unit = float(np.mean(problem.d))
+        speed = max(get_zero_impulse_reference(problem)[1], 1e-300)
         a = sp.csc_matrix(problem.csr[order][:, order] / unit)
         g = -problem.b[order] / speed
         model = pin.Model()
@@ -222,7 +243,8 @@ def _pinocchio(lanczos: int | None) -> Contestant:
             settings = pin.ADMMSolverSettings()
             settings.absolute_feasibility_tol = settings.absolute_complementarity_tol = eps
             settings.relative_feasibility_tol = settings.relative_complementarity_tol = 0.0
-            settings.max_iterations, settings.solve_ncp = cap, problem.law == "coulomb"
+            settings.max_iterations = cap
+            settings.solve_ncp = problem.law == "coulomb"
             if lanczos is not None:
                 settings.lanczos_size = lanczos
             start = process_time()
@@ -297,9 +319,16 @@ def _siconos(python: str, name: str, friction: bool) -> Contestant:
         with tempfile.TemporaryDirectory() as folder:
             given = Path(folder) / "problem.npz"
             np.savez(
-                given, A_data=a.data, A_indices=a.indices, A_indptr=a.indptr, b=problem.b, solver=name,
-                mu=problem.cones.mu if friction else np.zeros(0), tolerances=np.array(ladder), limit=limit,
-            )  # fmt: skip
+                given,
+                A_data=a.data,
+                A_indices=a.indices,
+                A_indptr=a.indptr,
+                b=problem.b,
+                solver=name,
+                mu=problem.cones.mu if friction else np.zeros(0),
+                tolerances=np.array(ladder),
+                limit=limit,
+            )
             script = Path(__file__).with_name("siconos_server.py")
             with subprocess.Popen(
                 [python, "-I", str(script), str(given), folder],
@@ -310,7 +339,11 @@ def _siconos(python: str, name: str, friction: bool) -> Contestant:
                     for i in range(len(ladder)):
                         answer = Path(folder) / f"{i}.npz"
                         patience = monotonic() + START + 4.0 * limit
-                        while not answer.exists() and process.poll() is None and monotonic() < patience:
+                        while (
+                            not answer.exists()
+                            and process.poll() is None
+                            and monotonic() < patience
+                        ):
                             _nap()
                         if not answer.exists():
                             return
@@ -354,13 +387,18 @@ def check_siconos(python: str) -> None:
     """
     try:
         done = subprocess.run(
-            [python, "-I", "-c", "import siconos.numerics"], capture_output=True, text=True, timeout=START
+            [python, "-I", "-c", "import siconos.numerics"],
+            capture_output=True,
+            text=True,
+            timeout=START,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise InputError(f"{python} cannot be run as the interpreter of Siconos: {error}") from None
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        raise InputError(f"{python} has no Siconos ({last}); on Debian: apt install python3-siconos")
+        raise InputError(
+            f"{python} has no Siconos ({last}); on Debian: apt install python3-siconos"
+        )
 
 
 # -- all contestants--------------------------------------------------------------------------------
@@ -391,12 +429,21 @@ def contestants(siconos: str = "") -> list[Contestant]:
         for form in PROGRAM_FORMS[:2]:
             # Backends with calls so short that the adapter's overhead matters, with dense and sparse matrices.
             ways = QUICK.get(backend.name)
-            made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
-                _backend(replace(backend, dense=dense), form, f"{backend.name}{word}, own interface")
-                for word, dense in ways
-            ]  # fmt: skip
+            made += (
+                [_backend(backend, form, "clarabel cones" if backend.cones else "")]
+                if ways is None
+                else [
+                    _backend(
+                        replace(backend, dense=dense), form, f"{backend.name}{word}, own interface"
+                    )
+                    for word, dense in ways
+                ]
+            )
     made += [
-        _cone(name, form) for name in ("scs", "qoco") if is_installed(name) for form in PROGRAM_FORMS[:2]
+        _cone(name, form)
+        for name in ("scs", "qoco")
+        if is_installed(name)
+        for form in PROGRAM_FORMS[:2]
     ]
     if is_installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
@@ -413,7 +460,11 @@ def contestants(siconos: str = "") -> list[Contestant]:
 
 def ours() -> list[Contestant]:
     """Return all of lavender's solvers, on problems with known A and from scratch."""
-    names = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
+    names = [
+        name
+        for name, spec in registry.specs().items()
+        if not spec.external and spec.missing() is None
+    ]
     return [_ours(name, scratch) for name in names for scratch in (False, True)]
 
 
@@ -429,7 +480,9 @@ def _ours(name: str, scratch: bool) -> Contestant:
             get_zero_impulse_reference(given)  # compute the judge's reference before timing
             first = given.start()
             start = process_time()
-            impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
+            impulse = prepared.solve(
+                impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit
+            ).impulse
             return seconds + process_time() - start, impulse
 
         if not scratch:

@@ -24,13 +24,15 @@ BACKEND_ENTRY_POINTS = {
     "osqp": ("osqp:OSQP.solve",),
     "piqp": ("piqp:DenseSolver.solve", "piqp:SparseSolver.solve"),
     "proxqp": (
-        "proxsuite.proxqp.dense:QP.solve", "proxsuite.proxqp.dense:solve",
-        "proxsuite.proxqp.sparse:QP.solve", "proxsuite.proxqp.sparse:solve",
+        "proxsuite.proxqp.dense:QP.solve",
+        "proxsuite.proxqp.dense:solve",
+        "proxsuite.proxqp.sparse:QP.solve",
+        "proxsuite.proxqp.sparse:solve",
     ),
     "qpalm": ("qpalm:Solver.solve",),
     "quadprog": ("qpsolvers.solvers.quadprog_:solve_qp",),
     "scs": ("qpsolvers.solvers.scs_:solve",),
-}  # fmt: skip
+}
 
 
 class _TimedObject:
@@ -78,7 +80,9 @@ def measure_backend_time(
             module = pkgutil.resolve_name(path)
             original = getattr(module, name)
 
-            def make_timed(*args: Any, original: Any = original, method: str = method, **kwargs: Any) -> Any:
+            def make_timed(
+                *args: Any, original: Any = original, method: str = method, **kwargs: Any
+            ) -> Any:
                 make, more = (timed(original), SETUP_METHODS) if setup else (original, ())
                 return _TimedObject(make(*args, **kwargs), (method, *more), timed)
 

@@ -20,8 +20,20 @@ from benchmarks.peers.problems import PROBLEMS, problems
 from benchmarks.peers.tables import engines_table, solvers_tables
 from lavender.report import machine
 
-PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
-            "quadprog", "scs")  # fmt: skip
+PACKAGES = (
+    "mujoco",
+    "pybullet",
+    "pin",
+    "clarabel",
+    "daqp",
+    "highspy",
+    "piqp",
+    "proxsuite",
+    "qoco",
+    "qpalm",
+    "quadprog",
+    "scs",
+)
 
 
 @click.command("peers")
@@ -29,9 +41,14 @@ PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", 
 @click.option("--engines/--no-engines", default=True, help="Step the scenes in every engine.")
 @click.option("--solvers/--no-solvers", default=True, help="Solve the problems with every solver.")
 @click.option(
-    "--scenes", default=",".join(peer_engines.SCENES), show_default=True, help="Scenes, commas between them."
+    "--scenes",
+    default=",".join(peer_engines.SCENES),
+    show_default=True,
+    help="Scenes, commas between them.",
 )
-@click.option("--sweeps", default=16, show_default=True, help="Of every engine that takes a number of them.")
+@click.option(
+    "--sweeps", default=16, show_default=True, help="Of every engine that takes a number of them."
+)
 @click.option(
     "--limit", default=2.0, show_default=True, metavar="S", help="CPU time of one call of a solver."
 )

@@ -53,7 +53,9 @@ class Step:
     contacts: int = 0
     depth: float = NAN  # m, deepest penetration, or largest joint error of a chain; nan: not known
     speed: float = NAN  # m/s, largest speed of a body
-    relative: float = NAN  # relative residual of the last step; nan if the engine's problem is not known
+    relative: float = (
+        NAN  # relative residual of the last step; nan if the engine's problem is not known
+    )
     note: str = ""
 
 
@@ -66,7 +68,8 @@ def _scene(name: str, **more: Any) -> Scene:
 
 #: Engines and modes, from those of the tower benchmark; elliptic friction cones if there is a choice.
 ENGINES: dict[str, Contestant] = {
-    name: stand.ENGINES[name] for name in ("lavender", "newton", "mujoco_pgs", "mujoco_newton", "pybullet")
+    name: stand.ENGINES[name]
+    for name in ("lavender", "newton", "mujoco_pgs", "mujoco_newton", "pybullet")
 }
 ENGINES["mujoco_pyramidal"] = replace(
     ENGINES["mujoco_newton"], name="mujoco Newton pyramidal", options={"cone": "pyramidal"}
@@ -122,7 +125,11 @@ def measure_scene(
         if name not in ENGINES:
             raise UnknownName("engine", name, ENGINES)
     asked = Tower(0, DT, sweeps)
-    known = [ENGINES[name] for name in engines if not get_missing_installation_command(ENGINES[name].needs)]
+    known = [
+        ENGINES[name]
+        for name in engines
+        if not get_missing_installation_command(ENGINES[name].needs)
+    ]
     notes: dict[int, str] = {}
     with ExitStack() as stack:
         made = []
@@ -135,9 +142,13 @@ def measure_scene(
             for done in range(settle):
                 stepping.step()
                 if process_time() - start > SETTLE_LIMIT:
-                    notes[i] = f"did not settle: {done + 1} of {settle} steps in {SETTLE_LIMIT:g} s of CPU"
+                    notes[i] = (
+                        f"did not settle: {done + 1} of {settle} steps in {SETTLE_LIMIT:g} s of CPU"
+                    )
                     break
-            size[i] = max(1, min(200, int(BATCH / max((process_time() - start) / max(settle, 1), 1e-6))))
+            size[i] = max(
+                1, min(200, int(BATCH / max((process_time() - start) / max(settle, 1), 1e-6)))
+            )
         best = np.full(len(made), np.inf)
         for _ in range(rounds):
             for i, stepping in enumerate(made):
@@ -155,5 +166,7 @@ def measure_scene(
             stepping.step()
             contacts, depth, relative = stepping.measure_last_step()
             speed = float(np.linalg.norm(stepping.get_state()[2][:, :3], axis=1).max(initial=0.0))
-            found.append(Step(scene, name, not one.sweeps, float(best[i]), contacts, depth, speed, relative))
+            found.append(
+                Step(scene, name, not one.sweeps, float(best[i]), contacts, depth, speed, relative)
+            )
         return found

@@ -16,7 +16,9 @@ from lavender.problem import Problem
 from lavender.report.timing import limit_to_one_thread
 
 REPEATS, REPEAT_TIME = 30, 0.1  # repeats of one setting: maximum number, and maximum total time [s]
-AGAIN = 4.0  # A contestant runs in later rounds if it is within this factor of the fastest of its side.
+AGAIN = (
+    4.0  # A contestant runs in later rounds if it is within this factor of the fastest of its side.
+)
 PATIENCE = 10.0  # s, wall time beyond four times the limit of a call after which a contestant is terminated
 
 
@@ -37,7 +39,8 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
                     if spent > REPEAT_TIME:
                         break
                     again = call()[0]
-                    spent, seconds = spent + max(again, 1e-6), min(seconds, again)
+                    spent = spent + max(again, 1e-6)
+                    seconds = min(seconds, again)
                 pipe.send((seconds, judged.relative))
                 if judged.relative <= least or judged.at_floor or late:
                     break
@@ -46,7 +49,9 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
         pipe.send(f"{type(error).__name__}: {error}"[:200])
 
 
-def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[tuple[float, float]], str]:
+def _run(
+    contestant: Contestant, problem: Problem, limit: float
+) -> tuple[list[tuple[float, float]], str]:
     context: Any = multiprocessing.get_context("fork" if hasattr(os, "fork") else "spawn")
     mine, other = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(other, contestant, problem, limit), daemon=False)
@@ -108,7 +113,9 @@ def race(
             for c in running if number % 2 == 0 else running[::-1]:
                 watch(f"{name}: {c.name}")
                 runs, note = _run(c, problem, limit)
-                result = here.setdefault(c.name, Result(name, problem.m, problem.law, c.name, c.peer))
+                result = here.setdefault(
+                    c.name, Result(name, problem.m, problem.law, c.name, c.peer)
+                )
                 result.runs += runs
                 result.note = result.note or note
             near = {c.name for c in running if _near(here[c.name], list(here.values()))}

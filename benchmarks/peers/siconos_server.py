@@ -44,22 +44,34 @@ def main():
     import siconos.numerics as sn
 
     given = np.load(sys.argv[1], allow_pickle=False)
-    m, mu, name = len(given["b"]), given["mu"], str(given["solver"])
-    limit, tolerances = float(given["limit"]), given["tolerances"]
+    m = len(given["b"])
+    mu = given["mu"]
+    name = str(given["solver"])
+    limit = float(given["limit"])
+    tolerances = given["tolerances"]
     q = -given["b"]
-    a = sp.csr_matrix((given["A_data"], given["A_indices"], given["A_indptr"]), shape=(m, m)).tocsc()
-    columns = sp.csc_matrix((a.data, a.indices.astype(np.int64), a.indptr.astype(np.int64)), shape=(m, m))
+    a = sp.csr_matrix(
+        (given["A_data"], given["A_indices"], given["A_indptr"]), shape=(m, m)
+    ).tocsc()
+    columns = sp.csc_matrix(
+        (a.data, a.indices.astype(np.int64), a.indptr.astype(np.int64)), shape=(m, m)
+    )
     contact = len(mu) > 0
     if contact:
         full = name.endswith(" dense")
         name = name.replace(" dense", "")
         problem = sn.FrictionContactProblem(
-            3, len(mu), a.toarray() if full else columns, np.ascontiguousarray(q), np.ascontiguousarray(mu)
+            3,
+            len(mu),
+            a.toarray() if full else columns,
+            np.ascontiguousarray(q),
+            np.ascontiguousarray(mu),
         )
         drive = sn.fc3d_driver
     else:
         matrix = columns if name in SPARSE else np.asfortranarray(a.toarray())
-        problem, drive = sn.LCP(matrix, np.ascontiguousarray(q)), sn.linearComplementarity_driver
+        problem = sn.LCP(matrix, np.ascontiguousarray(q))
+        drive = sn.linearComplementarity_driver
     kind = "FC3D" if contact else "LCP"
     sweeps = name.startswith(("NSGS", "ADMM")) or name in SPARSE
 

@@ -28,7 +28,15 @@ def over_ours(step: Step, steps: Sequence[Step]) -> float:
 
 def engines_table(steps: Sequence[Step]) -> str:
     """Return the table of engines with ratios in the same mode, or their notes; then LavenderSim's losses."""
-    head = ("scene", "engine", "time / ours", "contacts", "depth [mm]", "speed left [m/s]", "residual")
+    head = (
+        "scene",
+        "engine",
+        "time / ours",
+        "contacts",
+        "depth [mm]",
+        "speed left [m/s]",
+        "residual",
+    )
     rows, lost = [], []
     for s in steps:
         if not math.isfinite(s.time):
@@ -38,7 +46,15 @@ def engines_table(steps: Sequence[Step]) -> str:
         known = format_residual(s.relative) if math.isfinite(s.relative) else "not known"
         timed = f"{_ratio(over)} ({format_seconds(s.time)})"
         rows.append(
-            (s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", format_residual(s.speed), known)
+            (
+                s.scene,
+                s.engine,
+                timed,
+                s.contacts,
+                f"{1e3 * s.depth:.3g}",
+                format_residual(s.speed),
+                known,
+            )
         )
         if over < 1.0:
             lost.append((over, f"- {s.scene}: {s.engine}, {over:.2f} of the time of ours"))
@@ -66,7 +82,8 @@ class Comparison:
         """Lavender's times and those of auto over the fastest peer's; nan: no peer converged, inf: ours did not."""
         known = math.isfinite(self.peer_time)
         a, b, c = (
-            t / self.peer_time if known else math.nan for t in (self.our_time, self.scratch, self.auto)
+            t / self.peer_time if known else math.nan
+            for t in (self.our_time, self.scratch, self.auto)
         )
         return a, b, c
 
@@ -144,20 +161,30 @@ def means(results: Sequence[Result]) -> list[Mean]:
     out = []
     for group, compared in groups.items():
         for size, large in ((f"{LARGE} rows and more", True), ("smaller", False)):
-            of_size = [c for c in compared if (c.rows >= LARGE) is large and math.isfinite(c.peer_time)]
+            of_size = [
+                c for c in compared if (c.rows >= LARGE) is large and math.isfinite(c.peer_time)
+            ]
             for target in TARGETS:
                 some = [c.ratios for c in of_size if c.target == target]
                 if some:
-                    columns = [[x for x in column if math.isfinite(x)] for column in zip(*some, strict=True)]
+                    columns = [
+                        [x for x in column if math.isfinite(x)]
+                        for column in zip(*some, strict=True)
+                    ]
                     ours, scratch, auto = (
                         geometric_mean(column) if column else math.nan for column in columns
                     )
                     which = f"{group}, {size}"
                     out.append(
                         Mean(
-                            which=which, target=target, ours=ours, scratch=scratch, auto=auto, compared=len(columns[0])
+                            which=which,
+                            target=target,
+                            ours=ours,
+                            scratch=scratch,
+                            auto=auto,
+                            compared=len(columns[0]),
                         )
-                    )  # fmt: skip
+                    )
     return out
 
 
@@ -178,21 +205,43 @@ def solvers_tables(results: Sequence[Result]) -> str:
     """Return the tables of all problems and errors, geometric means, losses, and errors that no solver reached."""
     compared = compare(results)
     reached = [c for c in compared if math.isfinite(min(c.our_time, c.peer_time))]
-    head = ("problem", "rows", "law", "error", "ours", "fastest peer", "ours / peer", "from scratch", "auto")
+    head = (
+        "problem",
+        "rows",
+        "law",
+        "error",
+        "ours",
+        "fastest peer",
+        "ours / peer",
+        "from scratch",
+        "auto",
+    )
     rows = [
-        (c.problem, c.rows, c.law, f"{c.target:.0e}", _timed(c.ours, c.our_time), _timed(c.peer, c.peer_time),
-         *map(_ratio, c.ratios))
+        (
+            c.problem,
+            c.rows,
+            c.law,
+            f"{c.target:.0e}",
+            _timed(c.ours, c.our_time),
+            _timed(c.peer, c.peer_time),
+            *map(_ratio, c.ratios),
+        )
         for c in reached
-    ]  # fmt: skip
+    ]
     averages = [
         (m.which, f"{m.target:.0e}", *map(_ratio, (m.ours, m.scratch, m.auto)), m.compared)
         for m in means(results)
     ]
     lost = losses(compared)
     lines = [markdown(head, rows), ""]
-    lines += [markdown(("problems", "error", "ours / peer", "from scratch", "auto", "compared"), averages)]
+    lines += [
+        markdown(("problems", "error", "ours / peer", "from scratch", "auto", "compared"), averages)
+    ]
     lines += [f"\nLost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
-    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}" for c in lost]
+    lines += [
+        f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {_ratio(c.ratio)}"
+        for c in lost
+    ]
     alone = [c for c in reached if math.isinf(c.peer_time)]
     if alone:
         lines += ["", "Reached by no peer: " + _list(alone)]

@@ -57,13 +57,17 @@ def dome(rng: np.random.Generator, rows: int) -> World:
     turn = 2.0 * np.pi * (k + 0.5 * (ring % 2)) / around
     size = around / 6.0
     high, far = map_scalar(math.sin, up), map_scalar(math.cos, up)
-    position = size * np.stack([far * map_scalar(math.cos, turn), far * map_scalar(math.sin, turn), high], 1)
+    position = size * np.stack(
+        [far * map_scalar(math.cos, turn), far * map_scalar(math.sin, turn), high], 1
+    )
     index = np.arange(rings * around)
     side = np.stack([index, around * ring + (k + 1) % around], 1)
     world = World(position, BOX).add(between(position, side))
     upper = index[around:]
     first = upper - around
-    second = around * (ring[upper] - 1) + (k[upper] + np.where(ring[upper] % 2 == 1, 1, -1)) % around
+    second = (
+        around * (ring[upper] - 1) + (k[upper] + np.where(ring[upper] % 2 == 1, 1, -1)) % around
+    )
     lean = np.concatenate([np.stack([first, upper], 1), np.stack([second, upper], 1)])
     world.add(between(position, lean))
     foot = np.stack([np.full(around, -1), index[:around]], 1)
@@ -80,7 +84,9 @@ def packing(rng: np.random.Generator, rows: int) -> World:
     pairs = np.sort(np.stack([np.repeat(np.arange(n), near.shape[1]), near.ravel()], 1), axis=1)
     low = position[:, 2] <= np.quantile(position[:, 2], 0.15)
     return (
-        World(position, SPHERE).add(between(position, np.unique(pairs, axis=0))).add(on_floor(position, low))
+        World(position, SPHERE)
+        .add(between(position, np.unique(pairs, axis=0)))
+        .add(on_floor(position, low))
     )
 
 
@@ -101,14 +107,18 @@ def cloth(rng: np.random.Generator, rows: int) -> World:
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     off = (grid - 0.5 * (side - 1)) / (0.5 * side)
     height = 2.0 - (off**2).sum(axis=1)
-    position = np.stack([grid[:, 0], grid[:, 1], height], 1) + 0.01 * rng.standard_normal((side * side, 3))
+    position = np.stack([grid[:, 0], grid[:, 1], height], 1) + 0.01 * rng.standard_normal(
+        (side * side, 3)
+    )
     pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     world = World(position, 0.0).add(between(position, pairs))
     under = np.flatnonzero((off**2).sum(axis=1) < 0.6)
     normal = np.stack([0.4 * off[under, 0], 0.4 * off[under, 1], np.ones(len(under))], 1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return world.add(Contacts(np.stack([np.full(len(under), -1), under], 1), position[under], normal))
+    return world.add(
+        Contacts(np.stack([np.full(len(under), -1), under], 1), position[under], normal)
+    )
 
 
 def jelly(rng: np.random.Generator, rows: int) -> World:
@@ -146,7 +156,9 @@ def pegs(rng: np.random.Generator, rows: int) -> World:
     normal = rng.standard_normal((len(ball), 3))
     normal[:, 2] = np.abs(normal[:, 2])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    held = Contacts(np.stack([np.full(len(ball), -1), ball], 1), position[ball] - 0.5 * normal, normal)
+    held = Contacts(
+        np.stack([np.full(len(ball), -1), ball], 1), position[ball] - 0.5 * normal, normal
+    )
     pairs = spatial.cKDTree(position).query_pairs(1.2, output_type="ndarray")
     some = pairs[np.lexsort(pairs.T[::-1])][: n // 2] if len(pairs) else pairs
     return World(position, SPHERE).add(held).add(between(position, some))
@@ -156,9 +168,9 @@ def silo(rng: np.random.Generator, rows: int) -> World:
     """Draw a narrow column of balls between upright walls, two to five wide: walls carry what friction gives them."""
     wide = int(rng.integers(2, 6))
     high = max(1, round(rows / (4.0 * wide * wide)))
-    grid = np.stack(np.meshgrid(*map(np.arange, (high, wide, wide)), indexing="ij"), -1).reshape(-1, 3)[
-        :, ::-1
-    ]
+    grid = np.stack(np.meshgrid(*map(np.arange, (high, wide, wide)), indexing="ij"), -1).reshape(
+        -1, 3
+    )[:, ::-1]
     position = grid + [0.0, 0.0, 0.5] + 0.05 * rng.standard_normal(grid.shape)
     pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     world = World(position, SPHERE).add(between(position, pairs[np.lexsort(pairs.T[::-1])]))
@@ -167,7 +179,11 @@ def silo(rng: np.random.Generator, rows: int) -> World:
         for side, inwards in ((0, 1.0), (wide - 1, -1.0)):
             at = np.flatnonzero(grid[:, axis] == side)
             normal = inwards * np.eye(3)[axis]
-            world.add(Contacts(np.stack([np.full(len(at), -1), at], 1), position[at] - 0.5 * normal, normal))
+            world.add(
+                Contacts(
+                    np.stack([np.full(len(at), -1), at], 1), position[at] - 0.5 * normal, normal
+                )
+            )
     return world
 
 
@@ -177,7 +193,9 @@ def obstacle(rng: np.random.Generator, rows: int) -> Problem:
     line = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(side, side))
     eye = sp.eye_array(side)
     a = sp.csr_array(
-        sp.kron(line, eye) + sp.kron(eye, line) + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(side * side)
+        sp.kron(line, eye)
+        + sp.kron(eye, line)
+        + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(side * side)
     )
     x, y = (v.ravel() / side for v in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     force = rng.standard_normal() + 3.0 * map_scalar(
@@ -199,7 +217,9 @@ def network(rng: np.random.Generator, rows: int) -> Problem:
     incidence = sp.csr_array(ends, shape=(rows, n))
     a = sp.csr_array(incidence @ incidence.T + sp.diags_array(tenfold(rng.uniform(-4, 0, rows))))
     room = rng.exponential(1.0, rows)
-    return Problem.lcp(a, incidence @ rng.standard_normal(n), -room * (rng.random(rows) < 0.5), room)
+    return Problem.lcp(
+        a, incidence @ rng.standard_normal(n), -room * (rng.random(rows) < 0.5), room
+    )
 
 
 def boxed(rng: np.random.Generator, rows: int) -> Problem:
@@ -210,16 +230,22 @@ def boxed(rng: np.random.Generator, rows: int) -> Problem:
     width = rng.exponential(1.0, m)
     free = rng.random(m) < 0.1
     b = a @ rng.standard_normal(m)
-    return Problem.lcp(0.5 * (a + a.T), b, np.where(free, -np.inf, -width), np.where(free, np.inf, width))
+    return Problem.lcp(
+        0.5 * (a + a.T), b, np.where(free, -np.inf, -width), np.where(free, np.inf, width)
+    )
 
 
 def skew(rng: np.random.Generator, rows: int) -> Problem:
     """Draw a monotone matrix with a skew part as large as the rest (saddle points of games), dense or sparse."""
     m = max(4, rows // 2 * 2)
     share = 1.0 if m < 200 and rng.random() < 0.5 else min(1.0, 6.0 / m)
-    k = sp.random_array((m, m), density=share, rng=rng, data_sampler=lambda size: rng.standard_normal(size))
+    k = sp.random_array(
+        (m, m), density=share, rng=rng, data_sampler=lambda size: rng.standard_normal(size)
+    )
     own = 10.0 ** rng.uniform(-2.0, 0.5)
-    g = sp.random_array((m, m), density=share, rng=rng, data_sampler=lambda size: rng.standard_normal(size))
+    g = sp.random_array(
+        (m, m), density=share, rng=rng, data_sampler=lambda size: rng.standard_normal(size)
+    )
     a = sp.csr_array(
         g @ g.T / max(1.0, share * m) + own * sp.eye_array(m) + (k - k.T) * rng.uniform(0.1, 1.0)
     )
@@ -238,7 +264,10 @@ def hand(rng: np.random.Generator, rows: int) -> Problem:
     scale = tenfold(rng.uniform(-1.5, 1.5, nv))
     mass = scale[:, None] * (root @ root.T + 0.1 * np.eye(nv)) * scale
     v_free = rng.standard_normal(nv) / scale
-    soft = float(rng.choice([0.0, 1e-4])) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T).mean()
+    soft = (
+        float(rng.choice([0.0, 1e-4]))
+        * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T).mean()
+    )
     if friction == "none":
         cones = Cones.bounded(np.zeros(count), np.full(count, np.inf))
     else:
@@ -253,8 +282,11 @@ def option(rng: np.random.Generator, rows: int) -> Problem:
     """One implicit step of an American option: diffusion that grows with the price, and drift; an M-matrix."""
     m = max(4, rows)
     k = np.arange(1, m + 1)
-    step, sigma, rate = 10.0 ** rng.uniform(-3.0, 0.0), rng.uniform(0.1, 0.5), rng.uniform(0.0, 0.1)
-    wide, drift = 0.5 * (sigma * k) ** 2, rate * k
+    step = 10.0 ** rng.uniform(-3.0, 0.0)
+    sigma = rng.uniform(0.1, 0.5)
+    rate = rng.uniform(0.0, 0.1)
+    wide = 0.5 * (sigma * k) ** 2
+    drift = rate * k
     a = sp.diags_array(
         [-step * wide[1:], 1.0 + step * (2.0 * wide + drift + rate), -step * (wide + drift)[:-1]],
         offsets=[-1, 0, 1],
@@ -300,7 +332,9 @@ def beam(rng: np.random.Generator, rows: int) -> Problem:
     )
     x = (np.arange(m) + 0.5) / m
     load = (
-        -1.0 + 3.0 * map_scalar(math.sin, 2.0 * np.pi * x * rng.integers(1, 5)) + 0.3 * rng.standard_normal(m)
+        -1.0
+        + 3.0 * map_scalar(math.sin, 2.0 * np.pi * x * rng.integers(1, 5))
+        + 0.3 * rng.standard_normal(m)
     )
     return Problem.lcp(0.5 * (a + a.T), load / m, 0.0, rng.choice([np.inf, 2.0]))
 
@@ -336,7 +370,9 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     if name in MATRICES:
         problem = MATRICES[name](rng, max(4, round(wanted)))
         problem = replace(problem, name=title, copy=False)
-        return Draft(problem, f"{name}, {problem.law}, given as {problem.operator}: drawn, not chosen")
+        return Draft(
+            problem, f"{name}, {problem.law}, given as {problem.operator}: drawn, not chosen"
+        )
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
     world = WORLDS[name](rng, max(2, round(wanted / (5 if rolls else 1 if law == "none" else 3))))
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
@@ -344,13 +380,20 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
     soft = 10.0 ** rng.uniform(-4.0, 1.0) if name == "jelly" else None
     if rolls:
-        law, form = str(rng.choice(LAWS[1:3])), "rows"
+        law = str(rng.choice(LAWS[1:3]))
+        form = "rows"
         made = problem_of(rng, world, bodies, law).rows
         assert made is not None
-        more: dict[str, Any] = {"tangents": 2, "rolling": 10.0 ** rng.uniform(-3.0, -1.0), "friction": law}
+        more: dict[str, Any] = {
+            "tangents": 2,
+            "rolling": 10.0 ** rng.uniform(-3.0, -1.0),
+            "friction": law,
+        }
         more |= {"patch_radius": 0.02} if rng.random() < 0.5 else {}
         problem = Problem.from_rows(made, mu=rng.uniform(0.2, 0.9), **more)
     else:
         problem, form = given_as(rng, problem_of(rng, world, bodies, law, soft), form)
     problem = replace(problem, name=title, copy=False)
-    return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")
+    return Draft(
+        problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen"
+    )

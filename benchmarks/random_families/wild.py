@@ -69,7 +69,9 @@ class World:
         return self
 
 
-Structure = Callable[[np.random.Generator, int], World]  # (generator, rows wanted without friction) -> World
+Structure = Callable[
+    [np.random.Generator, int], World
+]  # (generator, rows wanted without friction) -> World
 
 
 def lattice(rng: np.random.Generator, rows: int) -> World:
@@ -81,9 +83,15 @@ def lattice(rng: np.random.Generator, rows: int) -> World:
     grid = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
     if rng.random() < 0.5:
         grid = grid[rng.random(len(grid)) < 0.9]
-    position = grid + np.array([0.0, 0.0, 0.5]) + rng.choice([0.0, 0.02]) * rng.standard_normal(grid.shape)
+    position = (
+        grid + np.array([0.0, 0.0, 0.5]) + rng.choice([0.0, 0.02]) * rng.standard_normal(grid.shape)
+    )
     pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
-    return World(position, SPHERE).add(between(position, pairs)).add(on_floor(position, grid[:, 2] == 0))
+    return (
+        World(position, SPHERE)
+        .add(between(position, pairs))
+        .add(on_floor(position, grid[:, 2] == 0))
+    )
 
 
 def heap(rng: np.random.Generator, rows: int) -> World:
@@ -127,10 +135,15 @@ def wall(rng: np.random.Generator, rows: int) -> World:
     position = np.stack([x, 0.0 * x, 0.5 + row], 1)
     index = np.arange(high * wide)
     pairs = [np.stack([np.full(wide, -1), index[:wide]], 1)]
-    centre, half = [position[:wide] - [0.0, 0.0, 0.5]], [np.full(wide, 0.5)]
+    centre = [position[:wide] - [0.0, 0.0, 0.5]]
+    half = [np.full(wide, 0.5)]
     upper = index[wide:]
     for shift in (-1, 1):
-        below = upper - wide + np.where((row[upper] % 2 == 1) == (shift == 1), max(0, shift), min(0, shift))
+        below = (
+            upper
+            - wide
+            + np.where((row[upper] % 2 == 1) == (shift == 1), max(0, shift), min(0, shift))
+        )
         at = column[upper] + below - (upper - wide)
         ok = (at >= 0) & (at < wide)
         a, b = below[ok], upper[ok]
@@ -149,7 +162,9 @@ def wall(rng: np.random.Generator, rows: int) -> World:
 def tree(rng: np.random.Generator, rows: int) -> World:
     """Draw a random tree of ball joints hung from the ceiling; perhaps some of its bodies lie on the floor."""
     n = max(2, rows // 3)
-    parent = np.array([-1, *(int(rng.integers(max(0, i - int(rng.integers(1, 9))), i)) for i in range(1, n))])
+    parent = np.array(
+        [-1, *(int(rng.integers(max(0, i - int(rng.integers(1, 9))), i)) for i in range(1, n))]
+    )
     world = _joined(rng, parent, BOX)
     return world.add(on_floor(world.position, rng.random(n) < 0.3)) if rng.random() < 0.5 else world
 
@@ -159,12 +174,16 @@ def net(rng: np.random.Generator, rows: int) -> World:
     side = max(2, round(np.sqrt(rows / 6)))
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     sag = 0.3 * map_scalar(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
-    position = np.stack([grid[:, 0], grid[:, 1], 1.0 - sag], 1) + 1e-3 * rng.standard_normal((side * side, 3))
+    position = np.stack([grid[:, 0], grid[:, 1], 1.0 - sag], 1) + 1e-3 * rng.standard_normal(
+        (side * side, 3)
+    )
     pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     corner = np.array([0, side - 1, side * (side - 1), side * side - 1])
     joint = np.concatenate([np.stack([np.full(4, -1), corner], 1), pairs])
-    anchor = np.concatenate([position[corner], 0.5 * (position[pairs[:, 0]] + position[pairs[:, 1]])])
+    anchor = np.concatenate(
+        [position[corner], 0.5 * (position[pairs[:, 0]] + position[pairs[:, 1]])]
+    )
     return World(position, BOX, joint=joint, anchor=anchor)
 
 
@@ -204,7 +223,9 @@ def anvil(rng: np.random.Generator, rows: int) -> World:
     foot = np.concatenate([rng.uniform(-1.0, 1.0, (n, 2)) * np.sqrt(n), np.full((n, 1), 0.5)], 1)
     position = np.concatenate([foot, [[0.0, 0.0, 2.0]]])
     k = np.arange(n)
-    top = Contacts(np.stack([k, np.full(n, n)], 1), foot + np.array([0.0, 0.0, 0.5]), [0.0, 0.0, 1.0])
+    top = Contacts(
+        np.stack([k, np.full(n, n)], 1), foot + np.array([0.0, 0.0, 0.5]), [0.0, 0.0, 1.0]
+    )
     return World(position, SPHERE).add(on_floor(position, np.arange(n + 1) < n)).add(top)
 
 
@@ -226,7 +247,9 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
     add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
     problem, form = given_as(rng, problem_of(rng, world, bodies, law), form)
     problem = replace(problem, name=f"wild(seed={seed}, rows={rows})", copy=False)
-    return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")
+    return Draft(
+        problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen"
+    )
 
 
 def given_as(rng: np.random.Generator, problem: Problem, form: str) -> tuple[Problem, str]:
@@ -259,10 +282,16 @@ def problem_of(
         m = 3 * joints + len(contacts.body)
         return Problem.from_rows(made, compliance=np.full(m, compliance))
     count = len(contacts.body)
-    mu = np.full(count, rng.uniform(0.05, 1.2)) if rng.random() < 0.5 else rng.uniform(0.0, 1.0, count)
+    mu = (
+        np.full(count, rng.uniform(0.05, 1.2))
+        if rng.random() < 0.5
+        else rng.uniform(0.0, 1.0, count)
+    )
     friction = "cone" if law == "cone" else "coulomb"
     m = 3 * (joints + count)
-    problem = Problem.from_rows(made, mu=mu, tangents=2, friction=friction, compliance=np.full(m, compliance))
+    problem = Problem.from_rows(
+        made, mu=mu, tangents=2, friction=friction, compliance=np.full(m, compliance)
+    )
     if law != "box" or not count:
         return problem
     return problem.boxed(guess_static_loads(bodies, contacts))
@@ -286,7 +315,8 @@ def _as_generalized(problem: Problem) -> Problem:
     size = 6 if rows.inv_inertia.any() else 3
     mass = np.zeros((rows.n_bodies, size, size))
     mass[:, [0, 1, 2], [0, 1, 2]] = (1.0 / rows.inv_mass)[:, None]
-    jac, v_free = rows.jacobian(problem.cones), rows.v_free
+    jac = rows.jacobian(problem.cones)
+    v_free = rows.v_free
     if size == 6:
         mass[:, 3:, 3:] = np.linalg.inv(rows.inv_inertia)
     else:
@@ -329,7 +359,9 @@ def between(position: FloatArray, pairs: np.ndarray) -> Contacts:
 def on_floor(position: FloatArray, which: np.ndarray) -> Contacts:
     """One contact with the floor right below each of those bodies."""
     k = np.flatnonzero(which)
-    return Contacts(np.stack([np.full(len(k), -1), k], 1), position[k] - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])
+    return Contacts(
+        np.stack([np.full(len(k), -1), k], 1), position[k] - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0]
+    )
 
 
 def _joined(rng: np.random.Generator, parent: np.ndarray, inertia: float) -> World:

@@ -57,7 +57,10 @@ def read_records(path: Path = PATH) -> dict[tuple[str, str, int, str], Record]:
         "residual": float,
     }
     with path.open(encoding="utf-8", newline="") as file:
-        rows = [Record(**{k: numbers.get(k, str)(v) for k, v in row.items()}) for row in csv.DictReader(file)]
+        rows = [
+            Record(**{k: numbers.get(k, str)(v) for k, v in row.items()})
+            for row in csv.DictReader(file)
+        ]
     return {row.key: row for row in rows}
 
 
@@ -67,6 +70,8 @@ def write_records(rows: Iterable[Record], path: Path = PATH) -> None:
     for row in sorted(rows, key=lambda row: row.key):
         values = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in asdict(row).values()]
         lines.append(
-            ",".join('"' + v.replace('"', '""') + '"' if set(v) & set(',"\n') else v for v in values)
+            ",".join(
+                '"' + v.replace('"', '""') + '"' if set(v) & set(',"\n') else v for v in values
+            )
         )
     write_text(path, "\n".join(lines) + "\n")

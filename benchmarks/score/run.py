@@ -16,12 +16,19 @@ from benchmarks.score.adapters import CannotExpress
 from benchmarks.score.records import PATH, Record, read_records, write_records
 from benchmarks.score.scenes import SCENES, classify
 from benchmarks.score.settings import ENGINES, Entry
-from benchmarks.score.simulate import Failed, Simulator, create_environment, find_program, split_requirement
+from benchmarks.score.simulate import (
+    Failed,
+    Simulator,
+    create_environment,
+    find_program,
+    split_requirement,
+)
 from lavender._version import __version__
 from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import ListType
 
-LEVELS, STEP_RATES = ("default", "accurate"), (240, 1000)
+LEVELS = ("default", "accurate")
+STEP_RATES = (240, 1000)
 CLASSES = ("good", "fair", "poor", "wrong")
 
 
@@ -41,7 +48,8 @@ def measure_cell(
     """Return errors, costs [µs], residual, note and curve of the runs of a cell."""
     errors: list[float] = []
     costs: list[float] = []
-    curve, residual = "", math.nan
+    curve = ""
+    residual = math.nan
     for _ in range(runs):
         simulator.start_cell()
         try:
@@ -75,7 +83,8 @@ def run_cells(
     try:
         for level, rate, scene in cells:
             curve = SCENES[scene].curve
-            simulator.settings, simulator.residuals = get_settings(entry, level), not curve
+            simulator.settings = get_settings(entry, level)
+            simulator.residuals = not curve
             simulator.limit = limit * (4 if curve else 1)
             errors, costs, residual, note, values = measure_cell(simulator, scene, rate, runs)
             if entry.fresh:
@@ -83,9 +92,20 @@ def run_cells(
             spread = max(errors) - min(errors) if all(map(math.isfinite, errors)) else math.nan
             version = get_version(entry)
             yield Record(
-                name, version, level, rate, scene, runs, errors[0], spread, min(costs), max(costs), residual,
-                note[:200].replace("\n", " "), values,
-            )  # fmt: skip
+                name,
+                version,
+                level,
+                rate,
+                scene,
+                runs,
+                errors[0],
+                spread,
+                min(costs),
+                max(costs),
+                residual,
+                note[:200].replace("\n", " "),
+                values,
+            )
     finally:
         simulator.close()
 
@@ -102,29 +122,51 @@ def make_table(rows: dict[tuple[str, str, int, str], Record], level: str, rate: 
         return f"{row.error:.2g} {CLASSES[classify(scene, row.error)][0]}"
 
     head = ("engine", *(f"{name} [{scene.unit}]" for name, scene in SCENES.items()))
-    return markdown(head, [(ENGINES[n].title, *(describe(n, scene) for scene in SCENES)) for n in names])
+    return markdown(
+        head, [(ENGINES[n].title, *(describe(n, scene) for scene in SCENES)) for n in names]
+    )
 
 
 @click.command("score")
 @click.option("--engine", type=ListType(str), help="Names with commas between; default: all.")
 @click.option("--scene", type=ListType(str), help="Names with commas between; default: all.")
 @click.option("--level", type=ListType(str), default=",".join(LEVELS), show_default=True)
-@click.option("--rate", type=ListType(int), default="240,1000", show_default=True, help="Steps a second.")
-@click.option("--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of each cell.")
 @click.option(
-    "--limit", type=click.FloatRange(0.1), default=10.0, show_default=True, help="CPU time of a cell [s]."
+    "--rate", type=ListType(int), default="240,1000", show_default=True, help="Steps a second."
+)
+@click.option(
+    "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of each cell."
+)
+@click.option(
+    "--limit",
+    type=click.FloatRange(0.1),
+    default=10.0,
+    show_default=True,
+    help="CPU time of a cell [s].",
 )
 @click.option("--again", is_flag=True, help="Run cells that the table has.")
 @click.option(
-    "--envs", type=click.Path(path_type=Path), help="Folder of the engines' environments; default: temporary."
+    "--envs",
+    type=click.Path(path_type=Path),
+    help="Folder of the engines' environments; default: temporary.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=PATH, help="Table; default: the one of the repository."
+    "--out",
+    type=click.Path(path_type=Path),
+    default=PATH,
+    help="Table; default: the one of the repository.",
 )
 def command(
-    engine: tuple[str, ...] | None, scene: tuple[str, ...] | None, level: tuple[str, ...], rate: tuple[int, ...],
-    repeat: int, limit: float, again: bool, envs: Path | None, out: Path,
-) -> None:  # fmt: skip
+    engine: tuple[str, ...] | None,
+    scene: tuple[str, ...] | None,
+    level: tuple[str, ...],
+    rate: tuple[int, ...],
+    repeat: int,
+    limit: float,
+    again: bool,
+    envs: Path | None,
+    out: Path,
+) -> None:
     """Run engines on contact scenes with truth formulas and add the cells that are missing to the table of results.
 
     Each engine runs in its own environment with pinned packages, which is created in --envs if it does not exist.
@@ -148,12 +190,18 @@ def command(
                 if (again or (old := rows.get((name, *cell))) is None or old.runs < repeat)
                 and (cell[1] == 240 or not SCENES[cell[2]].curve)
             ]
-            for row in run_cells(name, cells, envs or Path(temporary), repeat, limit) if cells else ():
+            for row in (
+                run_cells(name, cells, envs or Path(temporary), repeat, limit) if cells else ()
+            ):
                 rows[row.key] = row
                 write_records(rows.values(), out)
-                text = row.note or f"{row.error:.3g} {SCENES[row.scene].unit}, {row.cost:.0f} µs a step"
+                text = (
+                    row.note
+                    or f"{row.error:.3g} {SCENES[row.scene].unit}, {row.cost:.0f} µs a step"
+                )
                 click.echo(
-                    f"{name} {row.version}, {row.level}, 1/{row.rate} s, {row.scene}: {text}", err=True
+                    f"{name} {row.version}, {row.level}, 1/{row.rate} s, {row.scene}: {text}",
+                    err=True,
                 )
     for column, steps in product(level, rate):
         click.echo(f"\n{column} settings, 1/{steps} s\n\n{make_table(rows, column, steps)}")

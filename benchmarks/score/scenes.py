@@ -40,23 +40,40 @@ def make_body(size: Any, mass: float, position: Any, **more: Any) -> Description
         squares = np.square(size)
         inertia = [mass / 12 * float(squares.sum() - x) for x in squares]
     body = {
-        "shape": shape, "mass": mass, "inertia": inertia, "position": list(map(float, position)),
-        "quaternion": [1.0, 0.0, 0.0, 0.0], "velocity": [0.0] * 3, "spin": [0.0] * 3, "force": [0.0] * 3,
+        "shape": shape,
+        "mass": mass,
+        "inertia": inertia,
+        "position": list(map(float, position)),
+        "quaternion": [1.0, 0.0, 0.0, 0.0],
+        "velocity": [0.0] * 3,
+        "spin": [0.0] * 3,
+        "force": [0.0] * 3,
         "kinematic": False,
-    }  # fmt: skip
+    }
     return body | {k: v if isinstance(v, bool) else list(map(float, v)) for k, v in more.items()}
 
 
 def describe(name: str, seconds: float, bodies: Sequence[Description], **more: Any) -> Description:
     """Describe a scene; the ground is the first body unless `ground` is False."""
     plane = {
-        "shape": {"kind": "plane", "normal": [0.0, 0.0, 1.0], "offset": 0.0}, "mass": 0.0, "inertia": [0.0] * 3,
-        "position": [0.0] * 3, "quaternion": [1.0, 0.0, 0.0, 0.0], "velocity": [0.0] * 3, "spin": [0.0] * 3,
-    }  # fmt: skip
+        "shape": {"kind": "plane", "normal": [0.0, 0.0, 1.0], "offset": 0.0},
+        "mass": 0.0,
+        "inertia": [0.0] * 3,
+        "position": [0.0] * 3,
+        "quaternion": [1.0, 0.0, 0.0, 0.0],
+        "velocity": [0.0] * 3,
+        "spin": [0.0] * 3,
+    }
     scene = {
-        "name": name, "seconds": seconds, "gravity": [0.0, 0.0, -GRAVITY], "friction": FRICTION, "restitution": 0.0,
-        "bodies": [*([plane] if more.pop("ground", True) else []), *bodies], "joints": [], "planar": True,
-    }  # fmt: skip
+        "name": name,
+        "seconds": seconds,
+        "gravity": [0.0, 0.0, -GRAVITY],
+        "friction": FRICTION,
+        "restitution": 0.0,
+        "bodies": [*([plane] if more.pop("ground", True) else []), *bodies],
+        "joints": [],
+        "planar": True,
+    }
     return scene | more
 
 
@@ -66,15 +83,19 @@ def make_hinge(a: int, b: int, anchor: Any, motor: Sequence[float] | None = None
     `motor` is the speed [rad/s] and the largest torque [N m].
     """
     return {
-        "a": a, "b": b, "anchor": list(map(float, anchor)), "axis": [0.0, 1.0, 0.0],
+        "a": a,
+        "b": b,
+        "anchor": list(map(float, anchor)),
+        "axis": [0.0, 1.0, 0.0],
         "motor": None if motor is None else list(motor),
-    }  # fmt: skip
+    }
 
 
 def rotate(quaternion: FloatArray, vector: Any) -> FloatArray:
     """Rotate vectors by quaternions w x y z (..., 4), which need not be normalised."""
     q = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    u, v = q[..., 1:], np.broadcast_to(np.asarray(vector, float), q[..., 1:].shape)
+    u = q[..., 1:]
+    v = np.broadcast_to(np.asarray(vector, float), q[..., 1:].shape)
     twice = 2.0 * np.cross(u, v)
     rotated: FloatArray = v + q[..., :1] * twice + np.cross(u, twice)
     return rotated
@@ -137,7 +158,9 @@ def measure_roll(run: Run, dt: float) -> float:
 def measure_stack(run: Run, dt: float) -> float:
     """Return the largest displacement [m] of ten boxes of 10 kg after 5 s."""
     _, x = run(
-        describe("stack", 5.0, [make_body(CUBE, 10.0, (0, 0, 0.25 + 0.5 * i)) for i in range(10)]), dt, 0.5
+        describe("stack", 5.0, [make_body(CUBE, 10.0, (0, 0, 0.25 + 0.5 * i)) for i in range(10)]),
+        dt,
+        0.5,
     )
     return _measure_displacement(x[[0, -1]])
 
@@ -176,7 +199,8 @@ def measure_tumble(run: Run, dt: float) -> float:
     """Return the largest change [N m s] of the angular momentum of a free box in 10 s."""
     box = make_body((0.1, 0.2, 0.3), 1.0, (0, 0, 5), spin=(1, 4, 1))
     _, x = run(describe("tumble", 10.0, [box], gravity=[0.0] * 3, planar=False), dt, 0.1)
-    q, inertia = x[:, 0, 3:7], np.array(box["inertia"])
+    q = x[:, 0, 3:7]
+    inertia = np.array(box["inertia"])
     local = rotate(q * [1, -1, -1, -1], x[:, 0, 10:13])
     momentum = rotate(q, inertia * local)
     return float(np.linalg.norm(momentum - inertia * box["spin"], axis=1).max())
@@ -184,9 +208,12 @@ def measure_tumble(run: Run, dt: float) -> float:
 
 def measure_grip(run: Run, dt: float) -> float:
     """Return the creep [m/s] of a block between a plate and the ground at 0.9 times the load that friction can hold."""
-    normal, load = 10.0, 0.9 * 2 * FRICTION * 10.0  # N
+    normal = 10.0
+    load = 0.9 * 2 * FRICTION * 10.0  # N
     block = make_body((0.1, 0.1, 0.1), 1.0, (0, 0, 0.05), force=load * DIRECTION)
-    plate = make_body((0.1, 0.1, 0.05), 0.5, (0, 0, 0.125), force=-0.5 * load * DIRECTION - [0, 0, normal])
+    plate = make_body(
+        (0.1, 0.1, 0.05), 0.5, (0, 0, 0.125), force=-0.5 * load * DIRECTION - [0, 0, normal]
+    )
     t, x = run(describe("grip", 3.0, [block, plate], gravity=[0.0] * 3), dt, SAMPLE)
     return float(np.linalg.norm((_pick(t, x, 3.0) - _pick(t, x, 1.0))[:, :3], axis=1).max() / 2.0)
 
@@ -194,7 +221,9 @@ def measure_grip(run: Run, dt: float) -> float:
 def measure_cards(run: Run, dt: float) -> float:
     """Return the largest displacement [m] in 5 s of two cards that lean against each other at 15 degrees."""
     half = math.radians(7.5)
-    c, s, (thick, _, high) = math.cos(2 * half), math.sin(2 * half), (0.02, 0.3, 0.5)
+    c = math.cos(2 * half)
+    s = math.sin(2 * half)
+    (thick, _, high) = (0.02, 0.3, 0.5)
     aside, up = 0.5 * (thick * c + high * s), 0.5 * (thick * s + high * c)
     cards = [
         make_body(
@@ -223,9 +252,9 @@ def measure_pendulum(run: Run, dt: float) -> float:
     bob = make_body((0.1, 0.1, 0.1), 1.0, at)
     scene = describe("pendulum", 10.0, [bob], joints=[make_hinge(-1, 0, (0, 0, 5))])
     _, x = run(scene, dt, 0.05)
-    kinetic = 0.5 * (x[:, 0, 7:10] ** 2).sum(axis=1) + 0.5 * bob["inertia"][1] * (x[:, 0, 10:13] ** 2).sum(
-        axis=1
-    )
+    kinetic = 0.5 * (x[:, 0, 7:10] ** 2).sum(axis=1) + 0.5 * bob["inertia"][1] * (
+        x[:, 0, 10:13] ** 2
+    ).sum(axis=1)
     energy = kinetic + GRAVITY * x[:, 0, 2]
     return float(np.abs(energy - GRAVITY * at[2]).max())
 
@@ -240,7 +269,9 @@ def measure_gaps(scene: Description, x: FloatArray) -> float:
             if i < 0:
                 ends.append(np.broadcast_to(anchor, x[:, 0, :3].shape))
             else:
-                ends.append(x[:, i, :3] + rotate(x[:, i, 3:7], anchor - scene["bodies"][i]["position"]))
+                ends.append(
+                    x[:, i, :3] + rotate(x[:, i, 3:7], anchor - scene["bodies"][i]["position"])
+                )
         gaps.append(np.linalg.norm(ends[0] - ends[1], axis=1))
     return float(np.max(gaps))
 
@@ -252,7 +283,8 @@ def measure_four_bar(run: Run, dt: float) -> float:
     middles = [(pivots[0] + ends[0]) / 2, (ends[0] + ends[1]) / 2, (pivots[1] + ends[1]) / 2]
     bodies = [make_body((0.08, 0.08, 0.08), 1.0, middle) for middle in middles]
     joints = [
-        make_hinge(*h) for h in ((-1, 0, pivots[0]), (0, 1, ends[0]), (1, 2, ends[1]), (-1, 2, pivots[1]))
+        make_hinge(*h)
+        for h in ((-1, 0, pivots[0]), (0, 1, ends[0]), (1, 2, ends[1]), (-1, 2, pivots[1]))
     ]
     scene = describe("four-bar", 5.0, bodies, joints=joints, ground=False)
     return measure_gaps(scene, run(scene, dt, 0.05)[1])
@@ -312,7 +344,10 @@ class Scene:
 
 def _get_pendulum_floor(dt: float) -> float:
     """Return the energy error [J] of symplectic Euler steps of the angle."""
-    inertia, angle, speed, worst = 0.25 + 0.01 / 6, math.pi / 3, 0.0, 0.0
+    inertia = 0.25 + 0.01 / 6
+    angle = math.pi / 3
+    speed = 0.0
+    worst = 0.0
     for _ in range(round(10.0 / dt)):
         speed -= dt * GRAVITY * 0.5 * math.sin(angle) / inertia
         angle += dt * speed
@@ -325,36 +360,116 @@ _CREEP = "0.01 mm/s: a robot's grasp of a minute; 1 mm/s: not visible in a game"
 _PLACE = "0.1 mm: a robot's repeatability; 1 cm: not visible in a game"
 #: The classes were written before the first run of this command.
 SCENES: Mapping[str, Scene] = {
-    "stick": Scene(measure_stick, "m/s", (1e-5, 1e-3, 1e-2), "1° below the friction angle: v = 0", _CREEP),
-    "slip": Scene(measure_slip, "m/s²", (2e-3, 2e-2, 1e-1), "1° above it: a = g (sin t − μ cos t) = 0.191",
-                  "1 %, 10 % and 50 % of the truth"),
-    "slide": Scene(measure_slide, "m", (1e-2, 3e-2, 1e-1), "stops after v²/(2 μ g) = 0.917 m, straight",
-                   "1 %, 3 % and 10 % of the way", lambda dt: 1.5 * dt),
-    "roll": Scene(measure_roll, "m/s", (1e-2, 5e-2, 2e-1), "slides, then rolls at 5/7 v₀ = 1.429 m/s",
-                  "1 %, 3 % and 14 % of the truth"),
+    "stick": Scene(
+        measure_stick, "m/s", (1e-5, 1e-3, 1e-2), "1° below the friction angle: v = 0", _CREEP
+    ),
+    "slip": Scene(
+        measure_slip,
+        "m/s²",
+        (2e-3, 2e-2, 1e-1),
+        "1° above it: a = g (sin t − μ cos t) = 0.191",
+        "1 %, 10 % and 50 % of the truth",
+    ),
+    "slide": Scene(
+        measure_slide,
+        "m",
+        (1e-2, 3e-2, 1e-1),
+        "stops after v²/(2 μ g) = 0.917 m, straight",
+        "1 %, 3 % and 10 % of the way",
+        lambda dt: 1.5 * dt,
+    ),
+    "roll": Scene(
+        measure_roll,
+        "m/s",
+        (1e-2, 5e-2, 2e-1),
+        "slides, then rolls at 5/7 v₀ = 1.429 m/s",
+        "1 %, 3 % and 14 % of the truth",
+    ),
     "stack": Scene(measure_stack, "m", (1e-4, 1e-2, 1e-1), "ten boxes stay for 5 s", _PLACE),
     "ratio": Scene(measure_ratio, "m", (1e-4, 1e-2, 1e-1), "1000 kg on 1 kg stays for 3 s", _PLACE),
-    "bounce": Scene(measure_bounce, "m", (1e-2, 5e-2, 2e-1), "third rebound e⁶ h = 0.262 m, e = 0.8",
-                    "4 %, 20 % and 80 % of the truth"),
-    "tumble": Scene(measure_tumble, "N m s", (5e-5, 5e-4, 5e-3), "a free box keeps its angular momentum, 0.035 N m s",
-                    "0.1 %, 1 % and 10 % of it, rounded"),
-    "grip": Scene(measure_grip, "m/s", (1e-5, 1e-3, 1e-2), "at 0.9 of the load 2 μ N a gripped block rests", _CREEP),
-    "cards": Scene(measure_cards, "m", (1e-3, 1e-2, 5e-2), "two cards that lean by 15° stay",
-                   "1 mm: nothing happened; 1 cm: they lean; 5 cm: they have fallen"),
-    "belt": Scene(measure_belt, "m", (5e-3, 2e-2, 5e-2), "a slab on a belt slips by u²/(2 μ g) = 0.102 m",
-                  "5 %, 20 % and 50 % of the slip", lambda dt: 0.5 * dt),
-    "pendulum": Scene(measure_pendulum, "J", (0.03, 0.1, 0.5), "energy of a swing of 2.45 J stays for 10 s",
-                      "1 %, 4 % and 20 % of the swing", _get_pendulum_floor),
-    "four-bar": Scene(measure_four_bar, "m", (1e-4, 1e-3, 1e-2), "joints stay closed",
-                      "0.1 mm: play of a robot's joint; 1 mm: seen in a close-up; 1 cm: seen"),
-    "motor": Scene(measure_motor, "rad/s", (0.05, 0.2, 1.0), "ω = min(τ t / I, 5 rad/s), τ is the torque limit",
-                   "1 %, 4 % and 20 % of the speed"),
-    "heading": Scene(measure_heading, "1", (1e-2, 5e-2, 0.15), "a slab starts at slope μ = 0.5 in every direction",
-                     "2 %, 10 % and 30 % of μ; a measured μ is uncertain by 10 %", curve=True),
-    "rates": Scene(measure_rates, "m", (1e-2, 5e-2, 2e-1), "first rebound e² h = 0.64 m, 240 to 4000 steps a second",
-                   "as bounce", curve=True),
-    "ratios": Scene(measure_ratios, "m", (1e-4, 1e-2, 1e-1), "1 to 10⁴ kg on 1 kg stay for 3 s", _PLACE, curve=True),
-}  # fmt: skip
+    "bounce": Scene(
+        measure_bounce,
+        "m",
+        (1e-2, 5e-2, 2e-1),
+        "third rebound e⁶ h = 0.262 m, e = 0.8",
+        "4 %, 20 % and 80 % of the truth",
+    ),
+    "tumble": Scene(
+        measure_tumble,
+        "N m s",
+        (5e-5, 5e-4, 5e-3),
+        "a free box keeps its angular momentum, 0.035 N m s",
+        "0.1 %, 1 % and 10 % of it, rounded",
+    ),
+    "grip": Scene(
+        measure_grip,
+        "m/s",
+        (1e-5, 1e-3, 1e-2),
+        "at 0.9 of the load 2 μ N a gripped block rests",
+        _CREEP,
+    ),
+    "cards": Scene(
+        measure_cards,
+        "m",
+        (1e-3, 1e-2, 5e-2),
+        "two cards that lean by 15° stay",
+        "1 mm: nothing happened; 1 cm: they lean; 5 cm: they have fallen",
+    ),
+    "belt": Scene(
+        measure_belt,
+        "m",
+        (5e-3, 2e-2, 5e-2),
+        "a slab on a belt slips by u²/(2 μ g) = 0.102 m",
+        "5 %, 20 % and 50 % of the slip",
+        lambda dt: 0.5 * dt,
+    ),
+    "pendulum": Scene(
+        measure_pendulum,
+        "J",
+        (0.03, 0.1, 0.5),
+        "energy of a swing of 2.45 J stays for 10 s",
+        "1 %, 4 % and 20 % of the swing",
+        _get_pendulum_floor,
+    ),
+    "four-bar": Scene(
+        measure_four_bar,
+        "m",
+        (1e-4, 1e-3, 1e-2),
+        "joints stay closed",
+        "0.1 mm: play of a robot's joint; 1 mm: seen in a close-up; 1 cm: seen",
+    ),
+    "motor": Scene(
+        measure_motor,
+        "rad/s",
+        (0.05, 0.2, 1.0),
+        "ω = min(τ t / I, 5 rad/s), τ is the torque limit",
+        "1 %, 4 % and 20 % of the speed",
+    ),
+    "heading": Scene(
+        measure_heading,
+        "1",
+        (1e-2, 5e-2, 0.15),
+        "a slab starts at slope μ = 0.5 in every direction",
+        "2 %, 10 % and 30 % of μ; a measured μ is uncertain by 10 %",
+        curve=True,
+    ),
+    "rates": Scene(
+        measure_rates,
+        "m",
+        (1e-2, 5e-2, 2e-1),
+        "first rebound e² h = 0.64 m, 240 to 4000 steps a second",
+        "as bounce",
+        curve=True,
+    ),
+    "ratios": Scene(
+        measure_ratios,
+        "m",
+        (1e-4, 1e-2, 1e-1),
+        "1 to 10⁴ kg on 1 kg stay for 3 s",
+        _PLACE,
+        curve=True,
+    ),
+}
 
 
 def classify(scene: str, error: float) -> int:

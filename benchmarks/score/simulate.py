@@ -49,7 +49,9 @@ def find_program(name: str, entry: Entry, folder: Path) -> list[str] | None:
         return [sys.executable, "-m", "benchmarks.score.worker", entry.adapter]
     interpreter = folder / name / "bin" / "python"
     return (
-        [str(interpreter), "-m", "benchmarks.score.worker", entry.adapter] if interpreter.exists() else None
+        [str(interpreter), "-m", "benchmarks.score.worker", entry.adapter]
+        if interpreter.exists()
+        else None
     )
 
 
@@ -78,10 +80,19 @@ def create_environment(name: str, entry: Entry, folder: Path) -> None:
         ]
     else:
         subprocess.run([sys.executable, "-m", "venv", str(where)], check=True)
-        install = [str(where / "bin" / "python"), "-m", "pip", "install", "--quiet", *entry.packages]
+        install = [
+            str(where / "bin" / "python"),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            *entry.packages,
+        ]
     done = subprocess.run(install, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise LavenderError(f"{name} does not install: {(done.stderr or done.stdout).strip()[-300:]}")
+        raise LavenderError(
+            f"{name} does not install: {(done.stderr or done.stdout).strip()[-300:]}"
+        )
 
 
 class Simulator:
@@ -90,26 +101,38 @@ class Simulator:
     def __init__(
         self, command: list[str], settings: dict[str, Any], limit: float, residuals: bool = False
     ) -> None:
-        self.command, self.settings, self.limit, self.residuals = command, settings, limit, residuals
+        self.command, self.settings, self.limit, self.residuals = (
+            command,
+            settings,
+            limit,
+            residuals,
+        )
         self.program: JsonLines | None = None
         self.start_cell()
 
     def start_cell(self) -> None:
         """Forget the CPU time, steps and residual of the scenes so far."""
-        self.cpu, self.steps, self.residual = 0.0, 0, float("nan")
+        self.cpu = 0.0
+        self.steps = 0
+        self.residual = float("nan")
 
     def run(self, scene: Description, dt: float, every: float) -> tuple[FloatArray, FloatArray]:
         """Simulate a scene; see `scenes.Run`."""
         answer = self._request({"scene": scene, "options": {"dt": dt, **self.settings}})
-        check_properties(scene, answer["properties"], np.array(answer["states"], float).reshape(-1, 13))
-        total, between = round(scene["seconds"] / dt), max(1, round(every / dt))
+        check_properties(
+            scene, answer["properties"], np.array(answer["states"], float).reshape(-1, 13)
+        )
+        total = round(scene["seconds"] / dt)
+        between = max(1, round(every / dt))
         more = {"limit": self.limit - self.cpu, "residuals": MAX_RESIDUALS if self.residuals else 0}
         told = self._request({"steps": total, "every": between, **more})
         self.cpu, self.steps = self.cpu + told["cpu"], self.steps + told["done"]
         if told.get("residual") is not None:
             self.residual = np.fmax(self.residual, told["residual"])
         if told["done"] < total:
-            raise Failed(f"too slow: over {self.limit:g} s, {1e6 * self.cpu / self.steps:.0f} µs a step")
+            raise Failed(
+                f"too slow: over {self.limit:g} s, {1e6 * self.cpu / self.steps:.0f} µs a step"
+            )
         states = [*answer["states"], *told["states"]]
         t = np.array([*range(0, total, between), total], float) * dt
         return t, np.array(states, float).reshape(len(t), -1, 13)
@@ -139,14 +162,24 @@ class Simulator:
         self.program = None
 
 
-def check_properties(scene: Description, properties: list[list[float | None]], state: FloatArray) -> None:
+def check_properties(
+    scene: Description, properties: list[list[float | None]], state: FloatArray
+) -> None:
     """Raise Failed if an engine has other masses, inertias, materials or initial states than the scene."""
     names = ("mass", "inertia x", "inertia y", "inertia z", "friction", "restitution")
     for i, body in enumerate(b for b in scene["bodies"] if b["mass"] > 0):
         start = [*body["position"], *body["quaternion"], *body["velocity"], *body["spin"]]
         if not np.allclose(state[i], start, rtol=PROPERTY_TOLERANCE, atol=1e-5):
-            raise Failed(f"failed: body {i} starts with {np.round(state[i], 4).tolist()} in the engine")
+            raise Failed(
+                f"failed: body {i} starts with {np.round(state[i], 4).tolist()} in the engine"
+            )
         wanted = [body["mass"], *body["inertia"], scene["friction"], scene["restitution"]]
         for name, want, has in zip(names, wanted, properties[i], strict=True):
-            if has is not None and not body["kinematic"] and abs(has - want) > PROPERTY_TOLERANCE * abs(want):
-                raise Failed(f"failed: {name} of body {i} is {has:g} in the engine, {want:g} in the scene")
+            if (
+                has is not None
+                and not body["kinematic"]
+                and abs(has - want) > PROPERTY_TOLERANCE * abs(want)
+            ):
+                raise Failed(
+                    f"failed: {name} of body {i} is {has:g} in the engine, {want:g} in the scene"
+                )

@@ -49,8 +49,12 @@ def main(name: str) -> None:
 
 def _advance(engine: Any, request: dict[str, Any]) -> dict[str, Any]:
     """Make steps, `every` of them between two states, until the CPU time is above `limit`; see `simulate`."""
-    steps, every, limit = request.get("steps", 0), request.get("every", 1), request.get("limit", math.inf)
-    done, cpu, residuals = 0, 0.0, []
+    steps = request.get("steps", 0)
+    every = request.get("every", 1)
+    limit = request.get("limit", math.inf)
+    done = 0
+    cpu = 0.0
+    residuals = []
     states = [] if steps else [_read_state(engine)]
     while done < steps and cpu <= limit:
         n = min(CHUNK, every - done % every, steps - done)

@@ -28,13 +28,21 @@ class Problem(ct.Structure):
 def solve(matrix, b, lower):
     """Return the impulse (m,) [N s] of an LCP by the method `direct`."""
     lav = ct.CDLL("./liblavender.so")
-    q, options, budget, result = Problem(), (ct.c_byte * 64)(), (ct.c_byte * 64)(), (ct.c_int32 * 18)(72)
+    q = Problem()
+    options = (ct.c_byte * 64)()
+    budget = (ct.c_byte * 64)()
+    result = (ct.c_int32 * 18)(72)
     assert lav.lav_self_test() == lav.lav_default_problem(1, ct.byref(q)) == 0  # LAV_MATRIX
     assert lav.lav_default_options(10, options) == lav.lav_default_budget(budget) == 0  # LAV_DIRECT
-    m, impulse = len(b), np.zeros(len(b))
-    q.n_blocks, q.n_rows, q.n_entries = m, m, m * m
+    m = len(b)
+    impulse = np.zeros(len(b))
+    q.n_blocks = m
+    q.n_rows = m
+    q.n_entries = m * m
     q.value, q.b, q.lower = matrix.ctypes.data, b.ctypes.data, lower.ctypes.data
-    memory, size, solver = (ct.c_double * 4096)(), ct.c_uint64(8 * 4096), ct.c_void_p()
+    memory = (ct.c_double * 4096)()
+    size = ct.c_uint64(8 * 4096)
+    solver = ct.c_void_p()
     assert lav.lav_open(memory, size, ct.byref(q), options, ct.byref(solver)) == 0
     assert lav.lav_set(solver, ct.byref(q)) == lav.lav_run(solver, budget, result) == 0
     assert lav.lav_impulse(solver, ct.c_void_p(impulse.ctypes.data), m) == 0

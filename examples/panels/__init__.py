@@ -16,7 +16,8 @@ class Numbers(Mapping):
     """Results by name. Each is computed when it is first read, so that a panel computes only what it draws."""
 
     def __init__(self, **functions):
-        self._functions, self._values = functions, {}
+        self._functions = functions
+        self._values = {}
 
     def __getitem__(self, name):
         if name not in self._values:

@@ -12,8 +12,12 @@ import numpy as np
 
 import lavender as lv
 
-CHECK_EVERY = 10  # iterations between two looks at the residual, counted from the start of the state
-GROWN = 1e12  # relative residual above which nothing is to be hoped for: A has a negative eigenvalue
+CHECK_EVERY = (
+    10  # iterations between two looks at the residual, counted from the start of the state
+)
+GROWN = (
+    1e12  # relative residual above which nothing is to be hoped for: A has a negative eigenvalue
+)
 
 
 @dataclass
@@ -46,7 +50,8 @@ class APGD:
 
     def run(self, state, impulse, n, tol, time_limit=None):
         """n more iterations on `impulse` in place, fewer only where its own test stops it."""
-        problem, cones = state.problem, state.problem.cones
+        problem = state.problem
+        cones = state.problem.cones
         before = impulse.copy() if state.before is None else state.before
         for i in range(n):
             if tol > 0.0 and state.done % CHECK_EVERY == 0:
@@ -55,10 +60,13 @@ class APGD:
                     state.before = before
                     status = lv.Status.CONVERGED if relative <= tol else lv.Status.DIVERGED
                     return lv.Claim(status, i, {"products": i})
-            theta, now = state.theta, impulse.copy()
+            theta = state.theta
+            now = impulse.copy()
             after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
             y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - before)
-            impulse[:] = np.clip(y - state.step * (state.A @ y - problem.b), cones.lower, cones.upper)
+            impulse[:] = np.clip(
+                y - state.step * (state.A @ y - problem.b), cones.lower, cones.upper
+            )
             uphill = (y - impulse) @ ((impulse - now) / state.step) > 0.0
             state.theta = 1.0 if self.restart and uphill else after
             before = now

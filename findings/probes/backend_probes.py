@@ -140,10 +140,12 @@ def find_offset(name):
 
 def find_dependent(name):
     """Return the most frequent verdict on programs whose equalities depend on each other up to rounding."""
-    rng, verdicts = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    verdicts = []
     for _ in range(20):
         rows = rng.normal(size=(10, 20))
-        A, x = rng.normal(size=(15, 10)) @ rows, rng.normal(size=20)
+        A = rng.normal(size=(15, 10)) @ rows
+        x = rng.normal(size=20)
         found = run_alone(name, np.eye(20), np.zeros(20), A=A, b=A @ x)
         verdicts.append(give_verdict(found, np.linalg.pinv(rows) @ (rows @ x)))
     return max(set(verdicts), key=verdicts.count)
@@ -246,7 +248,8 @@ def piqp_solves_dense_arrays_only():
     sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
     from backend_truth import draw_program
 
-    program, tight = draw_program(285), {"eps_abs": 1e-6, "eps_rel": 0.0, "check_duality_gap": True}
+    program = draw_program(285)
+    tight = {"eps_abs": 1e-6, "eps_rel": 0.0, "check_duality_gap": True}
     tight |= {"eps_duality_gap_abs": 1e-6, "eps_duality_gap_rel": 0.0}
     sparse, dense = (run_alone("piqp", sparse=x, settings=tight, **program) for x in (True, False))
     return dense.found and not sparse.found
@@ -271,7 +274,8 @@ def highs_returns_zeros():
 def daqp_flags_what_qpsolvers_finds():
     import daqp
 
-    A, b = np.ones((2, 2)), np.array([1.0, 2.0])
+    A = np.ones((2, 2))
+    b = np.array([1.0, 2.0])
     flag = daqp.solve(np.eye(2), np.zeros(2), A, b, b, np.full(2, 5, np.int32))[2]
     return flag == -6 and run_alone("daqp", np.eye(2), [0, 0], A=A, b=b).found
 
@@ -279,7 +283,8 @@ def daqp_flags_what_qpsolvers_finds():
 def daqp_reads_a_slice_as_contiguous():
     import daqp
 
-    whole, bound = np.zeros((3, 3)), np.full(2, 9.0)
+    whole = np.zeros((3, 3))
+    bound = np.full(2, 9.0)
     whole[:2, :2] = [[2.0, 1.0], [1.0, 2.0]]
     arguments = -np.ones(2), np.zeros((0, 2)), bound, -bound, np.zeros(2, np.int32)
     found, right = (daqp.solve(P, *arguments) for P in (whole[:2, :2], whole[:2, :2].copy()))
@@ -289,9 +294,12 @@ def daqp_reads_a_slice_as_contiguous():
 def qpoases_reads_columns_as_rows():
     import qpsolvers
 
-    G, h = np.array([[1.0, 0.0], [5.0, 1.0], [0.0, 1.0]]), np.array([-1.0, 9.0, 2.0])
-    found = [qpsolvers.solve_problem(qpsolvers.Problem(np.eye(2), np.zeros(2), M, h), "qpoases")
-             for M in (G, np.asfortranarray(G))]  # fmt: skip
+    G = np.array([[1.0, 0.0], [5.0, 1.0], [0.0, 1.0]])
+    h = np.array([-1.0, 9.0, 2.0])
+    found = [
+        qpsolvers.solve_problem(qpsolvers.Problem(np.eye(2), np.zeros(2), M, h), "qpoases")
+        for M in (G, np.asfortranarray(G))
+    ]
     return give_verdict(found[0], [-1, 0]) == "right" and give_verdict(found[1], [-1, 0]) == "wrong"
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 import lavender as lv
 
-MAX_ROWS, UNITS = 120, (1.0, 1e6, 1e-6)
+MAX_ROWS = 120
+UNITS = (1.0, 1e6, 1e-6)
 TOLERANCE = 1e-3  # energy residual, relative to the zero impulse
 TIME_LIMIT = 2.0  # s for a problem, for packages with a limit
 

@@ -163,7 +163,8 @@ def load_pybullet(bullet, urdf, **options):
     "inertias of the collision shapes unless `URDF_USE_INERTIA_FROM_FILE` is passed.",
 )
 def pybullet_holds_joints():
-    bullet, angles = make_pybullet(), []
+    bullet = make_pybullet()
+    angles = []
     robot = load_pybullet(bullet, write_urdf("revolute"), flags=bullet.URDF_USE_INERTIA_FROM_FILE)
     inertia = bullet.getDynamicsInfo(robot, 0)[2]
     other = bullet.getDynamicsInfo(load_pybullet(bullet, write_urdf("revolute")), 0)[2]

@@ -24,7 +24,8 @@ def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), heigh
     import warp
 
     warp.config.quiet = True
-    solver_class, config = getattr(newton.solvers, name), newton.ModelBuilder.ShapeConfig
+    solver_class = getattr(newton.solvers, name)
+    config = newton.ModelBuilder.ShapeConfig
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # newton 1.8 warns of newer versions of MuJoCo.
         builder, world = newton.ModelBuilder(), newton.ModelBuilder()

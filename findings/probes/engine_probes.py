@@ -583,7 +583,8 @@ def warp_leaves_old_rows():
     with warp.ScopedDevice("cpu"):
         data.qpos.assign(position)
         mujoco_warp.step(mujoco_warp.put_model(model), data)
-    counts, force = [data.nefc.numpy()[0], data.nacon.numpy()[0]], data.efc.force.numpy()[0].sum()
+    counts = [data.nefc.numpy()[0], data.nacon.numpy()[0]]
+    force = data.efc.force.numpy()[0].sum()
     return counts == [0, 0] and 8.0 < force < 12.0 and data.contact.dist.numpy()[0] < 0.0
 
 
@@ -729,7 +730,12 @@ def make_genesis(*entities, gravity=(0.0, 0.0, -9.81)):
     "Both are contained in the rows, which are read.",
 )
 def genesis_uses_the_larger_friction():
-    floor, box = (lambda morphs: morphs.Plane()), (lambda morphs: morphs.Box(size=(0.2,) * 3, pos=(0, 0, 0.1)))
+    def floor(morphs):
+        return morphs.Plane()
+
+    def box(morphs):
+        return morphs.Box(size=(0.2,) * 3, pos=(0, 0, 0.1))
+
     scene = make_genesis((floor, {"friction": 0.2}), (box, {"friction": 0.8, "rho": 125}), gravity=(5.0, 0.0, -10.0))
     for _ in range(80):
         scene.step()
@@ -756,14 +762,17 @@ def box2d_impulses_are_of_the_last_substep():
 
     def add_box(world, kind, y, half_width, half_height):
         body, shape = ffi.new("b2BodyDef*", lib.b2DefaultBodyDef()), ffi.new("b2ShapeDef*", lib.b2DefaultShapeDef())
-        body.type, body.position.y, shape.density = kind, y, 1.0
+        body.type = kind
+        body.position.y = y
+        shape.density = 1.0
         polygon = ffi.new("b2Polygon*", lib.b2MakeBox(half_width, half_height))
         return lib.b2CreatePolygonShape(lib.b2CreateBody(world, body), shape, polygon)
 
     sums = []
     for n, has_warm_start in ((1, True), (4, True), (4, False)):
         definition = ffi.new("b2WorldDef*", lib.b2DefaultWorldDef())
-        definition.gravity.y, definition.enableSleep = -10.0, False
+        definition.gravity.y = -10.0
+        definition.enableSleep = False
         world = lib.b2CreateWorld(definition)
         lib.b2World_EnableWarmStarting(world, has_warm_start)
         add_box(world, 0, -1.0, 50.0, 1.0)
@@ -792,7 +801,8 @@ def siconos_error_changes_with_the_unit_of_mass():
 
     errors = []
     for mass in (1e-3, 1.0, 1e3):
-        matrix, q = np.eye(3) / mass, np.array([-1.0, 0.0, 0.0])
+        matrix = np.eye(3) / mass
+        q = np.array([-1.0, 0.0, 0.0])
         problem = numerics.FrictionContactProblem(3, matrix, q, np.array([0.5]))
         reaction = np.array([1.1 * mass, 0.0, 0.0])
         options = numerics.SolverOptions(numerics.SICONOS_FRICTION_3D_NSGS)

@@ -79,7 +79,7 @@ def main(out):
         ("arm", True, {"friction_cone": "elliptic"}),
         ("convex", False, {"friction_cone": "elliptic"} | convex),
         ("pyramids", False, {"friction_cone": "pyramidal"}),
-    ):  # fmt: skip
+    ):
         scene = step_scene(with_arm, **options)
         rows = int(qd_to_numpy(read(scene, f"{STATE}.n_constraints")).max())
         for path in PATHS:

@@ -16,14 +16,35 @@ import numpy as np
 
 DT, STEPS = 0.01, 40
 INFO = (
-    "num_bodies", "bodies_offset", "num_joint_dynamic_cts", "joint_dynamic_cts_offset",
-    "joint_dynamic_cts_group_offset", "num_joint_effort_cts", "joint_effort_cts_offset",
-    "joint_effort_cts_group_offset", "joint_kinematic_cts_group_offset",
-)  # fmt: skip
+    "num_bodies",
+    "bodies_offset",
+    "num_joint_dynamic_cts",
+    "joint_dynamic_cts_offset",
+    "joint_dynamic_cts_group_offset",
+    "num_joint_effort_cts",
+    "joint_effort_cts_offset",
+    "joint_effort_cts_group_offset",
+    "joint_kinematic_cts_group_offset",
+)
 PROBLEM = (
-    "njc", "nbc", "nl", "nc", "dim", "maxdim", "bcio", "cio", "vio", "mio", "D", "P", "u_f", "v_f",
-    "bound_lower", "bound_upper", "mu",
-)  # fmt: skip
+    "njc",
+    "nbc",
+    "nl",
+    "nc",
+    "dim",
+    "maxdim",
+    "bcio",
+    "cio",
+    "vio",
+    "mio",
+    "D",
+    "P",
+    "u_f",
+    "v_f",
+    "bound_lower",
+    "bound_upper",
+    "mu",
+)
 JOINTS = ("wid", "num_dynamic_cts", "num_kinematic_cts", "num_friction_cts", "num_effort_cts")
 CONTACTS = ("model_active_contacts", "wid", "cid", "bid_AB")
 PATHS = (

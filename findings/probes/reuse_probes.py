@@ -18,7 +18,8 @@ class OsqpSession:
     def __init__(self, P, q, A, limit=None):
         import osqp
 
-        self.solver, one = osqp.OSQP(), np.ones(len(A))
+        self.solver = osqp.OSQP()
+        one = np.ones(len(A))
         settings = {} if limit is None else {"time_limit": limit}
         self.solver.setup(
             sp.csc_matrix(sp.triu(P)), q, sp.csc_matrix(A), -one, one, verbose=False, warm_starting=False, **settings
@@ -52,9 +53,11 @@ class ClarabelSession:
         import clarabel
 
         settings = clarabel.DefaultSettings()
-        settings.verbose, settings.max_threads = False, 1
+        settings.verbose = False
+        settings.max_threads = 1
         settings.time_limit = math.inf if limit is None else limit
-        rows, cones = sp.csc_matrix(np.vstack([A, -A])), [clarabel.NonnegativeConeT(2 * len(A))]
+        rows = sp.csc_matrix(np.vstack([A, -A]))
+        cones = [clarabel.NonnegativeConeT(2 * len(A))]
         self.solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(P)), q, rows, np.ones(2 * len(A)), cones, settings)
 
     def solve(self):
@@ -66,9 +69,13 @@ class QpalmSession:
     def __init__(self, P, q, A, limit=None):
         import qpalm
 
-        data, settings = qpalm.Data(len(q), len(A)), qpalm.Settings()
-        data.Q, data.q, data.A = sp.csc_matrix(P), q, sp.csc_matrix(A)
-        data.bmin, data.bmax = -np.ones(len(A)), np.ones(len(A))
+        data = qpalm.Data(len(q), len(A))
+        settings = qpalm.Settings()
+        data.Q = sp.csc_matrix(P)
+        data.q = q
+        data.A = sp.csc_matrix(A)
+        data.bmin = -np.ones(len(A))
+        data.bmax = np.ones(len(A))
         settings.verbose = False
         if limit is not None:
             settings.time_limit = limit
@@ -108,13 +115,19 @@ class HighsSession:
 
         self.solver, model = highspy.Highs(), highspy.HighsModel()
         self.solver.setOptionValue("output_flag", False)
-        lower, rows, one = sp.csc_matrix(np.tril(P)), sp.csc_matrix(A), np.ones(len(A))
+        lower = sp.csc_matrix(np.tril(P))
+        rows = sp.csc_matrix(A)
+        one = np.ones(len(A))
         model.hessian_.dim_ = len(q)
         model.hessian_.start_, model.hessian_.index_, model.hessian_.value_ = lower.indptr, lower.indices, lower.data
         lp = model.lp_
-        lp.num_col_, lp.num_row_, lp.col_cost_ = len(q), len(A), q
-        lp.col_lower_, lp.col_upper_ = np.full(len(q), -np.inf), np.full(len(q), np.inf)
-        lp.row_lower_, lp.row_upper_ = -one, one
+        lp.num_col_ = len(q)
+        lp.num_row_ = len(A)
+        lp.col_cost_ = q
+        lp.col_lower_ = np.full(len(q), -np.inf)
+        lp.col_upper_ = np.full(len(q), np.inf)
+        lp.row_lower_ = -one
+        lp.row_upper_ = one
         lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
         lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
         self.solver.passModel(model)
@@ -128,7 +141,8 @@ class DaqpModel:
     def __init__(self, P, q, A, limit=0.0):
         import daqp
 
-        self.solver, one = daqp.Model(), np.ones(len(A))
+        self.solver = daqp.Model()
+        one = np.ones(len(A))
         self.solver.settings = self.solver.settings | {"time_limit": limit}
         self.solver.setup(P, q, A, one, -one)
 
@@ -153,7 +167,8 @@ def find_time_limit(name):
     """Return whether a limit shorter than set-up and solve together, but longer than the solve, allows a solution."""
     if name not in ("osqp", "scs", "daqp", "clarabel"):
         return ""
-    rng, sparse = np.random.default_rng(0), name == "clarabel"  # Only its set-up of sparse rows takes long.
+    rng = np.random.default_rng(0)
+    sparse = name == "clarabel"  # Only its set-up of sparse rows takes long.
     root = np.zeros((1, 1)) if sparse else rng.normal(size=(800, 800)) / 28.0
     n = SPARSE_SIZE if sparse else len(root)
     P = sp.eye_array(n, format="csc") if sparse else root @ root.T + np.eye(n)

@@ -59,7 +59,9 @@ MIN_TASKS_PER_WORKER = 10  # With fewer tasks, the progress and the remaining ti
 DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about this time.
 # If `worlds` is None, at most this many are simulated; more would hardly change the quantiles.
 MAX_DEFAULT_WORLDS = 4096
-DEFAULT_JOINT_WORLDS = 8  # Default number of worlds of other engines, and of episodes of environments.
+DEFAULT_JOINT_WORLDS = (
+    8  # Default number of worlds of other engines, and of episodes of environments.
+)
 TIMED_STEPS = 20  # Steps of world 0 that are timed if the number of worlds is given.
 # [s] Steps that take less time are judged in this process: each worker process takes a second to start.
 MIN_DURATION_OF_WORKERS = 2.0
@@ -70,13 +72,27 @@ DIVERGENCE_MARGIN = 25
 
 
 def audit(
-    model: Any, *, policy: Callable[[Any], Any] | None = None, worlds: int | None = None, steps: int = 200,
-    engine: str = "mujoco", control: Control = "random", seed: int = 0, spread: float | None = None,
-    states: Any = None, against: Any = None, keep: int | None = None, keep_contact_states: bool = False,
-    precision: str | None = None, threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
-    njmax: int | None = None, workers: int = -1, backend: str = "loky",
+    model: Any,
+    *,
+    policy: Callable[[Any], Any] | None = None,
+    worlds: int | None = None,
+    steps: int = 200,
+    engine: str = "mujoco",
+    control: Control = "random",
+    seed: int = 0,
+    spread: float | None = None,
+    states: Any = None,
+    against: Any = None,
+    keep: int | None = None,
+    keep_contact_states: bool = False,
+    precision: str | None = None,
+    threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
+    njmax: int | None = None,
+    workers: int = -1,
+    backend: str = "loky",
     watch: Callable[[Event], None] | None = None,
-) -> Audit:  # fmt: skip
+) -> Audit:
     """Simulate worlds of a model and judge the engine's answer to every step.
 
     Parameters
@@ -147,33 +163,55 @@ def audit(
     judging = Judging(precision or "float64", threshold, keep)
     common: dict[str, Any] = {"threshold": threshold, "error_limit": limit}
     if is_environment(model):
-        own = {"engine": engine == "mujoco", "control": isinstance(control, str) and control == "random",
-               "spread": spread is None, "states": states is None, "against": against is None}  # fmt: skip
+        own = {
+            "engine": engine == "mujoco",
+            "control": isinstance(control, str) and control == "random",
+            "spread": spread is None,
+            "states": states is None,
+            "against": against is None,
+        }
         for name in (name for name, is_default in own.items() if not is_default):
-            raise InputError(f"{name} has no effect with an environment, which steps itself: leave it out")
+            raise InputError(
+                f"{name} has no effect with an environment, which steps itself: leave it out"
+            )
         episodes = DEFAULT_JOINT_WORLDS if worlds is None else worlds
         runs = make_environment_runs(model, episodes, steps, seed)
         pieces = _audit_environment(model, policy, runs, judging)
         return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
     if policy is not None:
-        raise InputError("policy needs a gymnasium environment as model; for a model of MuJoCo give control=")
+        raise InputError(
+            "policy needs a gymnasium environment as model; for a model of MuJoCo give control="
+        )
     if against is not None and engine != "mujoco":
         raise InputError(f"against is given and engine is {engine!r}; 'mujoco' is needed for it")
     if njmax is not None and engine != "mujoco_warp":
-        raise InputError(f"njmax is {njmax} and engine is {engine!r}; 'mujoco_warp' is needed for it")
+        raise InputError(
+            f"njmax is {njmax} and engine is {engine!r}; 'mujoco_warp' is needed for it"
+        )
     if engine in CLAIM_ENGINES:
         if control != "random":
-            raise InputError(f"control needs a model of MuJoCo; scenes of {engine} have their own: leave it")
+            raise InputError(
+                f"control needs a model of MuJoCo; scenes of {engine} have their own: leave it"
+            )
         start = {"states": states, "spread": SPREADS[0] if spread is None else spread, "seed": seed}
         n = DEFAULT_JOINT_WORLDS if worlds is None else worlds
         stepped = step_scene(model, engine, worlds=n, steps=steps, **start)
         return audit_steps(
-            stepped, engine=engine, name=str(model), threshold=threshold, max_velocity_error=limit, keep=keep,
-            total=steps, seed=seed, watch=watch,
-        )  # fmt: skip
+            stepped,
+            engine=engine,
+            name=str(model),
+            threshold=threshold,
+            max_velocity_error=limit,
+            keep=keep,
+            total=steps,
+            seed=seed,
+            watch=watch,
+        )
     default_worlds = MAX_DEFAULT_WORLDS if engine == "mujoco" else DEFAULT_JOINT_WORLDS
     n = default_worlds if worlds is None else worlds
-    runs = Runs.of_model(model, n, steps, states=states, against=against, control=control, seed=seed)
+    runs = Runs.of_model(
+        model, n, steps, states=states, against=against, control=control, seed=seed
+    )
     if engine == "mujoco":
         more = (keep_contact_states, workers, backend, watch, common)
         return _audit_model(runs, judging, worlds, spread, *more)
@@ -186,10 +224,17 @@ def audit(
 
 
 def audit_steps(
-    steps: Iterable[EngineStep], *, engine: str = "engine", name: str = "steps",
-    threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None, keep: int | None = None,
-    total: int = 0, seed: int = 0, watch: Callable[[Event], None] | None = None,
-) -> Audit:  # fmt: skip
+    steps: Iterable[EngineStep],
+    *,
+    engine: str = "engine",
+    name: str = "steps",
+    threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
+    keep: int | None = None,
+    total: int = 0,
+    seed: int = 0,
+    watch: Callable[[Event], None] | None = None,
+) -> Audit:
     """Judge the steps of an engine and compare its claims with the verdicts.
 
     Parameters
@@ -229,9 +274,16 @@ def audit_steps(
 
 
 def _audit_model(
-    runs: Runs, judging: Judging, worlds: int | None, spread: float | None, keep_contact_states: bool,
-    workers: int, backend: str, watch: Callable[[Event], None] | None, common: dict[str, Any],
-) -> Audit:  # fmt: skip
+    runs: Runs,
+    judging: Judging,
+    worlds: int | None,
+    spread: float | None,
+    keep_contact_states: bool,
+    workers: int,
+    backend: str,
+    watch: Callable[[Event], None] | None,
+    common: dict[str, Any],
+) -> Audit:
     """Audit a model of MuJoCo: time its first world, choose the spread, and judge all worlds in worker processes."""
     processes = count_processes(workers)
     # Raise the error of an unsupported model once and before any worker starts.
@@ -266,7 +318,7 @@ def _audit_model(
 
 def _collect(
     result: Audit, pieces: Iterable[Piece], judging: Judging, watch: Callable[[Event], None] | None
-) -> Audit:  # fmt: skip
+) -> Audit:
     """Add pieces to a result until their end or Ctrl-C, and show the progress."""
     if watch is not None:
         text = f"{format_count(result.runs.worlds, 'world')} of {format_count(result.runs.steps, 'step')}"
@@ -308,11 +360,14 @@ def audit_worlds(runs: Runs, judging: Judging, worlds: Sequence[int]) -> list[Pi
         simulations = [simulate_world(runs, world) for world in worlds]
         states, after = (np.concatenate([result[k] for result in simulations]) for k in (0, 2))
         divergences = [divergence for _, divergence, _ in simulations if divergence is not None]
-        world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
+        world = np.repeat(worlds, runs.steps)
+        step = np.tile(np.arange(runs.steps), len(worlds))
         pieces = list(judge_states(runs.model, judging, states, world, step, after))
         if runs.against is not None:
             others = judge_states(runs.against[1], judging, states, world, step)
-            pieces = [own._replace(against=other) for own, other in zip(pieces, others, strict=True)]
+            pieces = [
+                own._replace(against=other) for own, other in zip(pieces, others, strict=True)
+            ]
     pieces[-1] = pieces[-1]._replace(divergences=divergences, engine_warnings=engine_warnings)
     return pieces
 
@@ -324,7 +379,8 @@ def judge_states(
 
     `after` (n, nv) are the velocities after the steps, with which the predicted ones are compared.
     """
-    judge, mj = copy.copy(model), import_mujoco()
+    judge = copy.copy(model)
+    mj = import_mujoco()
     judge.opt.noslip_iterations = 0
     for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
         part = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
@@ -354,9 +410,13 @@ def _audit_environment(env: Any, policy: Any, runs: Runs, judging: Judging) -> I
     with count_engine_warnings(runs.mj) as engine_warnings:
         for world in range(runs.worlds):
             lost: Divergence | None = None
-            for model, states, after, first, diverged in iterate_environment(env, policy, runs, world):
+            for model, states, after, first, diverged in iterate_environment(
+                env, policy, runs, world
+            ):
                 step = first + np.arange(len(states))
-                for piece in judge_states(model, judging, states, np.full(len(states), world), step, after):
+                for piece in judge_states(
+                    model, judging, states, np.full(len(states), world), step, after
+                ):
                     yield piece._replace(engine_warnings=dict(engine_warnings))
                     engine_warnings.clear()
                 if diverged:

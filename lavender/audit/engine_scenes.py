@@ -66,9 +66,15 @@ def step_scene(scene: Any, engine: str, *, steps: int = 50, **start: Any) -> Ite
 
 
 def start_scene(
-    scene: str | os.PathLike[str] | Callable[..., Any], engine: str, *, worlds: int = 8,
-    dt: float = DEFAULT_TIME_STEP, states: Any = None, spread: float = 0.0, seed: int = 0,
-) -> NewtonScene | GenesisScene:  # fmt: skip
+    scene: str | os.PathLike[str] | Callable[..., Any],
+    engine: str,
+    *,
+    worlds: int = 8,
+    dt: float = DEFAULT_TIME_STEP,
+    states: Any = None,
+    spread: float = 0.0,
+    seed: int = 0,
+) -> NewtonScene | GenesisScene:
     """Build a scene and set the start states of its worlds.
 
     Parameters
@@ -86,12 +92,18 @@ def start_scene(
     seed : int, default 0
     """
     check_name("engine", engine, CLAIM_ENGINES)
-    worlds, dt = check_int("worlds", worlds, 1), check_float("dt", dt, above=0.0)
-    spread, seed = check_float("spread", spread, low=0.0), check_int("seed", seed, high=None)
+    worlds = check_int("worlds", worlds, 1)
+    dt = check_float("dt", dt, above=0.0)
+    spread = check_float("spread", spread, low=0.0)
+    seed = check_int("seed", seed, high=None)
     build = scene if callable(scene) else load_build_function(scene, engine)
     names = GENESIS_STATE if engine == "genesis" else NEWTON_STATE
     starts = None if states is None else read_engine_states(states, names)
-    running = GenesisScene(build, worlds) if engine == "genesis" else NewtonScene(build, engine, worlds, dt)
+    running = (
+        GenesisScene(build, worlds)
+        if engine == "genesis"
+        else NewtonScene(build, engine, worlds, dt)
+    )
     first_noisy = 1
     if starts is not None:
         running.set_state({name: x[np.arange(running.n) % len(x)] for name, x in starts.items()})
@@ -120,7 +132,9 @@ def read_engine_states(source: Any, names: tuple[str, ...]) -> EngineState:
     counts = {name: len(x) if x.ndim > 1 else 0 for name, x in arrays.items()}
     if not counts or len(set(counts.values())) != 1 or not min(counts.values()):
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "no arrays"
-        raise InputError(f"{label}: {sizes}; {', '.join(names)} must have equally many entries, at least one")
+        raise InputError(
+            f"{label}: {sizes}; {', '.join(names)} must have equally many entries, at least one"
+        )
     return arrays
 
 
@@ -129,7 +143,9 @@ def load_build_function(scene: str | os.PathLike[str], engine: str) -> Any:
     path = Path(scene)
     if path.suffix == ".py":
         if not path.is_file():
-            raise InputError(f"{path} does not exist; a Python file with a function build() is needed")
+            raise InputError(
+                f"{path} does not exist; a Python file with a function build() is needed"
+            )
         build = runpy.run_path(str(path)).get("build")
         if not callable(build):
             raise InputError(f"{path} has no function build(), which makes the scene")
@@ -168,7 +184,9 @@ class NewtonScene:
         except ImportError:
             raise InputError(NEWTON_MISSING) from None
         self.newton, self.engine, self.dt = newton, engine, dt
-        self.solver_type = newton.solvers.SolverKamino if engine == "kamino" else newton.solvers.SolverMuJoCo
+        self.solver_type = (
+            newton.solvers.SolverKamino if engine == "kamino" else newton.solvers.SolverMuJoCo
+        )
         model = build()
         if isinstance(model, newton.ModelBuilder):
             builder = newton.ModelBuilder()
@@ -180,12 +198,15 @@ class NewtonScene:
             raise InputError(
                 f"build() returned a {type(model).__name__}; a newton.ModelBuilder or newton.Model is needed"
             )
-        self.model, self.n = model, int(model.world_count)
+        self.model = model
+        self.n = int(model.world_count)
         self.solver = self.solver_type(model)
         self.before, self.after, self.control = model.state(), model.state(), model.control()
         self.pipeline = newton.CollisionPipeline(model)
         self.contacts = self.pipeline.contacts()
-        self.velocity: Any = None  # Velocities before the step; SolverMuJoCo overwrites its own copy.
+        self.velocity: Any = (
+            None  # Velocities before the step; SolverMuJoCo overwrites its own copy.
+        )
 
     def step(self) -> None:
         """Detect collisions and step all worlds."""
@@ -218,15 +239,21 @@ class NewtonScene:
     @property
     def _has_equal_worlds(self) -> bool:
         """Return whether all worlds have equal numbers of bodies and joints, so that states fit one array per name."""
-        return self.n > 0 and all(len(getattr(self.before, name)) % self.n == 0 for name in NEWTON_STATE)
+        return self.n > 0 and all(
+            len(getattr(self.before, name)) % self.n == 0 for name in NEWTON_STATE
+        )
 
     def _require_equal_worlds(self, advice: str) -> None:
         if not self._has_equal_worlds:
-            raise InputError(f"the worlds of this scene have different bodies or joints, so {advice}")
+            raise InputError(
+                f"the worlds of this scene have different bodies or joints, so {advice}"
+            )
 
     def set_state(self, state: EngineState) -> None:
         """Set the state of all worlds, arrays (n, ...), and clear the solver's warm start."""
-        self._require_equal_worlds("states cannot be set in one array for all worlds: leave states out")
+        self._require_equal_worlds(
+            "states cannot be set in one array for all worlds: leave states out"
+        )
         given = [group for group in NEWTON_GROUPS if all(name in state for name in group)]
         if not given:
             raise InputError(
@@ -276,7 +303,9 @@ class NewtonScene:
             try:
                 self.solver._update_mjc_data(self.solver.mjw_data, self.model, self.before)
             except AttributeError as error:
-                raise CapabilityError(f"SolverMuJoCo takes no state: {error}. {NEWTON_ADVICE}") from None
+                raise CapabilityError(
+                    f"SolverMuJoCo takes no state: {error}. {NEWTON_ADVICE}"
+                ) from None
 
 
 class GenesisScene:
@@ -290,7 +319,8 @@ class GenesisScene:
     """
 
     def __init__(self, build: Callable[[int], Any], worlds: int) -> None:
-        self.scene, self.n = build(worlds), worlds
+        self.scene = build(worlds)
+        self.n = worlds
         solver = getattr(getattr(self.scene, "sim", None), "rigid_solver", None)
         if solver is None:
             raise InputError(
@@ -310,7 +340,10 @@ class GenesisScene:
     def get_state(self) -> EngineState:
         """Return positions and velocities of all environments (n, ...)."""
         arrays = self.solver.get_qpos(), self.solver.get_dofs_velocity()
-        return {name: np.array(x.cpu().numpy(), float) for name, x in zip(GENESIS_STATE, arrays, strict=True)}
+        return {
+            name: np.array(x.cpu().numpy(), float)
+            for name, x in zip(GENESIS_STATE, arrays, strict=True)
+        }
 
     def set_state(self, state: EngineState) -> None:
         """Set the state of all environments, arrays (n, ...), and clear the solver's warm start."""

@@ -42,7 +42,8 @@ def make_environment_runs(env: Any, episodes: int, steps: int, seed: int) -> Run
 def capture_steps(mj: Any, env: Any) -> Iterator[Captured]:
     """Append each call of `mujoco.mj_step` for the data of an environment to a list."""
     captured: Captured = []
-    kind, mj_step = mj.mjtState.mjSTATE_INTEGRATION, mj.mj_step
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    mj_step = mj.mj_step
 
     def step(model: Any, data: Any, nstep: int = 1) -> None:
         """Step like `mujoco.mj_step`, one step at a time."""

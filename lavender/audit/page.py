@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
-OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
+OUTSIDE_SOLVER = (
+    "outside the constraint solver (time step, integrator, actuators or the model itself)"
+)
 DIVERGENCE_ADVICE = (
     'To find out whether the solver is the cause, audit again with <option solver="Newton" iterations="100" '
     'tolerance="1e-12"/>: if worlds diverge again after exact solves, the cause is the model.'
@@ -39,9 +41,16 @@ DIVERGENCE_ADVICE = (
 STOPPED_NOTE = "Stopped before the end: the numbers contain only the completed part."
 QUANTILE_LINES = {"median": 0.5, "90 %": 0.9, "99 %": 0.99, "worst": 1.0}
 MAX_BINS = 50  # Largest number of bins of steps of the figure over time.
-MAX_STRIP_WORLDS, MAX_STRIP_STEPS = 240, 400  # A cell of more worlds or steps has their largest error.
-SHOWN_RATIO = 1e-6  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
-TREND_RATIO = 2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
+MAX_STRIP_WORLDS, MAX_STRIP_STEPS = (
+    240,
+    400,
+)  # A cell of more worlds or steps has their largest error.
+SHOWN_RATIO = (
+    1e-6  # Errors below this fraction of the limit lie in the strip at the bottom of the figure.
+)
+TREND_RATIO = (
+    2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
+)
 MAX_NAMED_ROWS = 8  # Rows of the table of rows.
 CLASS_COLORS = ("var(--h4)", "var(--h3)", "var(--h1)", "var(--bad)", "var(--ink)")
 ERROR_DEFINITION = (
@@ -92,28 +101,46 @@ class ResultPage:
 def make_audit_page(audit: Any, folder: Path | None) -> Page:
     """Make the page of an audit: size of the error, when and where, cause, next command."""
     counts = AuditCounts(audit)
-    runs, model = audit.runs, audit.runs.name
+    runs = audit.runs
+    model = audit.runs.name
     blocks: list[Any] = []
     if folder is not None and counts.n:
         tables = [*counts.make_sizes_table(), *counts.make_rows_table()]
         if audit.worst:
             rows: list[Any] = []
             for i, w in enumerate(audit.worst, 1):
-                place, row = f"world {w.world}, step {w.step}", split_row_unit(w.where)[0]
+                place = f"world {w.world}, step {w.step}"
+                row = split_row_unit(w.where)[0]
                 rows.append([f"worst_{i}.npz", (place, "q", ""), (row, "text", "")])
             command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
             tables += [make_table(rows, title="Look at the worst steps"), {"code": command}]
         blocks.append({"pair": [[markupsafe.Markup(counts.draw_errors(folder))], tables]})
     sections = (
-        ("The same states", audit.comparison, "Both models solve the same steps from the same states."),
-        ("What the engine claims", audit.claims, "A wrong claim hides an error; a missing claim costs iterations."),
+        (
+            "The same states",
+            audit.comparison,
+            "Both models solve the same steps from the same states.",
+        ),
+        (
+            "What the engine claims",
+            audit.claims,
+            "A wrong claim hides an error; a missing claim costs iterations.",
+        ),
         ("Quantiles of the errors", audit.errors, ""),
         ("Rows and contacts of a step", audit.judged_sizes.table, ""),
-        ("Worlds that diverged", audit.diverged, "The last step, and whether every solve until then was exact."),
-    )  # fmt: skip
+        (
+            "Worlds that diverged",
+            audit.diverged,
+            "The last step, and whether every solve until then was exact.",
+        ),
+    )
     blocks += [fold_table(title, frame, note) for title, frame, note in sections if len(frame)]
-    blocks.append({"folded": [{"note": ERROR_DEFINITION}], "title": "How errors are defined", "open": False})
-    source = f"lavender audit · {model} · {audit.engine} · {runs.worlds} worlds × {runs.steps} steps"
+    blocks.append(
+        {"folded": [{"note": ERROR_DEFINITION}], "title": "How errors are defined", "open": False}
+    )
+    source = (
+        f"lavender audit · {model} · {audit.engine} · {runs.worlds} worlds × {runs.steps} steps"
+    )
     code = []
     if counts.above and audit.engine == "mujoco" and not audit.divergences:
         states = audit.folder / "states.npz"
@@ -121,8 +148,18 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
     files = "records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)"
     footer = [f"{starts}. Files: {files}."]
-    return Page("lavender audit", source, counts.verdict, counts.sentences, code, mark=counts.mark,
-                is_bad=counts.is_bad, warnings=audit.advice, blocks=blocks, footer=footer)  # fmt: skip
+    return Page(
+        "lavender audit",
+        source,
+        counts.verdict,
+        counts.sentences,
+        code,
+        mark=counts.mark,
+        is_bad=counts.is_bad,
+        warnings=audit.advice,
+        blocks=blocks,
+        footer=footer,
+    )
 
 
 class AuditCounts:
@@ -138,13 +175,14 @@ class AuditCounts:
         close, within = (int((errors <= limit).sum()) for limit in (audit.threshold, self.limit))
         with np.errstate(invalid="ignore"):
             self.is_above = self.sizes > self.limit
-        self.n, self.above = audit.n_judged, int(self.is_above.sum())
+        self.n = audit.n_judged
+        self.above = int(self.is_above.sum())
         self.classes = [
             ("rounding only", int((at_floor & audit.is_judged).sum())),
             (f"up to {format_speed(audit.threshold)}", close),
             (f"up to {format_speed(self.limit)}: the limit", max(within - close, 0)),
             (f"more than {format_speed(self.limit)}", self.above),
-        ]  # fmt: skip
+        ]
         self.largest = float(np.nanmax(self.sizes)) if self.n else 0.0
         place = np.nanargmax(self.sizes) if self.n else 0
         self.world, self.step = map(int, np.unravel_index(place, self.sizes.shape))
@@ -156,15 +194,19 @@ class AuditCounts:
     @property
     def verdict(self) -> str:
         """The size of the error, with divergence first, and steps that were not judged."""
-        audit, limit = self.audit, format_speed(self.limit)
+        audit = self.audit
+        limit = format_speed(self.limit)
         parts = []
         if audit.divergences:
             first = min(d.step for d in audit.divergences)
-            parts.append(f"{format_count(audit.n_diverged, 'world')} diverged, the first at step {first}")
+            parts.append(
+                f"{format_count(audit.n_diverged, 'world')} diverged, the first at step {first}"
+            )
         if not self.n:
             parts.append("no step was judged")
         elif self.above:
-            n, share = format_number(self.n), format_percent(self.above, self.n)
+            n = format_number(self.n)
+            share = format_percent(self.above, self.n)
             worst = format_speed(self.largest, self.unit, self.limit)
             is_wrong = "is" if self.above == 1 else "are"
             parts.append(
@@ -174,7 +216,9 @@ class AuditCounts:
         else:
             largest = format_speed(self.largest, self.unit, self.limit)
             by = f"by more than {largest}" if self.largest else "beyond rounding"
-            parts.append(f"no step is wrong {by}; the limit is {format_speed(self.limit, self.unit)}")
+            parts.append(
+                f"no step is wrong {by}; the limit is {format_speed(self.limit, self.unit)}"
+            )
         if lost := int((audit.verdict == len(VERDICTS)).sum()):
             parts.append(f"{format_count(lost, 'step')} not judged")
         if audit.n_dropped:
@@ -208,7 +252,8 @@ class AuditCounts:
         text = f"Worst: step {self.step} of world {self.world}{row}."
         steps = self.errors.shape[1]
         if self.above:
-            worlds, first = int(self.is_above.any(axis=1).sum()), int(np.argmax(self.is_above.any(axis=0)))
+            worlds = int(self.is_above.any(axis=1).sum())
+            first = int(np.argmax(self.is_above.any(axis=0)))
             text += f" Above the limit from step {first} on, in {worlds} of {format_count(len(self.errors), 'world')}."
         quarter = steps // 4
         if quarter < 5 or not self.n:
@@ -227,13 +272,18 @@ class AuditCounts:
 
     def _describe_cause(self) -> str:
         """Return the cause of divergence or of errors above the limit, and claims of the engine that are false."""
-        audit, texts = self.audit, []
+        audit = self.audit
+        texts = []
         stopped, wrong = (audit.verdict == VERDICTS.index(word) for word in (UNCONVERGED, WRONG))
         if audit.divergences:
             exact = sum(map(audit.has_exact_solves, audit.divergences))
             if exact:
                 one = "Every solve until a world diverged"
-                some = one if exact == audit.n_diverged else f"In {exact} worlds every solve until divergence"
+                some = (
+                    one
+                    if exact == audit.n_diverged
+                    else f"In {exact} worlds every solve until divergence"
+                )
                 texts.append(f"{some} was exact: the cause lies {OUTSIDE_SOLVER}.")
             if exact < audit.n_diverged:
                 texts.append(DIVERGENCE_ADVICE if audit.engine == "mujoco" else ENGINE_ADVICE)
@@ -252,16 +302,20 @@ class AuditCounts:
             texts.append("Every solve converged.")
         if audit.converged is not None:
             counts = list(audit.claim_counts.values())
-            claimed, false = counts[0] + counts[1] + counts[4], counts[1] + counts[4]
+            claimed = counts[0] + counts[1] + counts[4]
+            false = counts[1] + counts[4]
             is_wrong = f"{false} {'is' if false == 1 else 'are'} wrong"
-            texts.append(f"Of {format_count(claimed, 'solve')} that the engine calls converged, {is_wrong}.")
+            texts.append(
+                f"Of {format_count(claimed, 'solve')} that the engine calls converged, {is_wrong}."
+            )
         return " ".join(texts)
 
     # -- figures and tables --------------------------------------------------------------------------------
 
     def draw_errors(self, folder: Path) -> str:
         """Draw quantiles of the errors with time, and below each world as a line of colours, the worst first."""
-        audit, low = self.audit, SHOWN_RATIO * self.limit
+        audit = self.audit
+        low = SHOWN_RATIO * self.limit
         worlds, steps = self.errors.shape
         bins = np.array_split(np.arange(steps), min(steps, MAX_BINS))
         x = np.array([b[0] for b in bins] + [steps])
@@ -285,7 +339,9 @@ class AuditCounts:
             last = dict(zip(QUANTILE_LINES, map(float, q[:, -1]), strict=True))
             axes.set_xlim(0, steps)
             for i, alpha in enumerate((0.38, 0.24, 0.12)):
-                axes.fill_between(x, q[i], q[i + 1], step="post", color=drawing.BLUE, alpha=alpha, lw=0)
+                axes.fill_between(
+                    x, q[i], q[i + 1], step="post", color=drawing.BLUE, alpha=alpha, lw=0
+                )
             for i, width in ((0, 1.2), (3, 0.7)):
                 axes.step(x, q[i], where="post", color=drawing.BLUE, lw=width)
             labels += [drawing.Label(y, name, drawing.BLUE) for name, y in last.items() if y == y]
@@ -304,7 +360,9 @@ class AuditCounts:
             filled = np.where(np.isnan(self.sizes), -1.0, self.sizes)
             errors = np.array([[filled[np.ix_(r, c)].max() for c in columns] for r in rows])
             errors = np.where(errors < 0.0, np.nan, errors)
-            drawing.draw_error_strip(strip, errors, audit.threshold, self.limit, (0, steps, worlds, 0))
+            drawing.draw_error_strip(
+                strip, errors, audit.threshold, self.limit, (0, steps, worlds, 0)
+            )
             strip.set_ylabel(f"{worlds} worlds, worst first" if worlds > 1 else "one world")
             strip.set_xlabel("step")
             strip.set_yticks([])
@@ -312,17 +370,24 @@ class AuditCounts:
                 style = {"ms": 6, "color": drawing.INK, "mfc": "none", "mew": 1.2, "clip_on": False}
                 strip.plot([self.step + 0.5], [max(worlds / 60.0, 0.5)], "v", **style)
             ends = ", ".join(f"{name} {format_speed(y)}" for name, y in last.items())
-            return (
-                f"Velocity error against step of {worlds} worlds; in the last steps: {ends}. {self.verdict}"
-            )
+            return f"Velocity error against step of {worlds} worlds; in the last steps: {ends}. {self.verdict}"
 
         note = (
             "Above: errors of the steps that have rows, over all worlds: median, 90 %, 99 % and worst; below "
             f"{format_power(low)} m/s rounding decides. Below: each line is a world, ▽ the worst step (records.npz)."
         )
         margins = {"left": 0.13, "right": 0.75, "top": 0.985, "bottom": 0.085, "hspace": 0.1}
-        return drawing.draw_figure("errors", fill, (4.9, 4.9), margins, note=note, folder=folder, nrows=2, sharex=True,
-                           height_ratios=[1.45, 1.0])  # fmt: skip
+        return drawing.draw_figure(
+            "errors",
+            fill,
+            (4.9, 4.9),
+            margins,
+            note=note,
+            folder=folder,
+            nrows=2,
+            sharex=True,
+            height_ratios=[1.45, 1.0],
+        )
 
     def make_sizes_table(self) -> list[Any]:
         """Make the stacked bar and the table of the numbers of steps by the size of their error."""
@@ -333,7 +398,9 @@ class AuditCounts:
         parts = []
         for i, ((name, n), color) in enumerate(zip(classes, CLASS_COLORS, strict=False)):
             css = "bad" if i >= 3 and n else "q" if i < 2 else ""
-            parts.append((name, color, n / total, [format_number(n), format_percent(n, total)], css))
+            parts.append(
+                (name, color, n / total, [format_number(n), format_percent(n, total)], css)
+            )
         small = f"{format_number(self.n)} steps by the error of their worst row"
         return make_shares(parts, "Shares of the steps: ", title="How wrong", small=small)
 
@@ -346,7 +413,9 @@ class AuditCounts:
         high = np.log10(max(where[0][1][1], self.limit) * 1.3)
 
         def place(x: float) -> float:
-            return float(np.clip(100.0 * (np.log10(max(x, 1e-15)) - low) / (high - low), 0.0, 100.0))
+            return float(
+                np.clip(100.0 * (np.log10(max(x, 1e-15)) - low) / (high - low), 0.0, 100.0)
+            )
 
         rows: list[Any] = []
         for name, (n, largest) in where[:MAX_NAMED_ROWS]:
@@ -393,8 +462,13 @@ class StepSizes:
     @property
     def contact_phrase(self) -> str:
         """Phrase with the number of steps that have contact and the fraction that is needed."""
-        n, object_name = len(self.rows), "contact" if self.can_touch else "a constraint"
-        fraction = f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})" if n else ""
+        n = len(self.rows)
+        object_name = "contact" if self.can_touch else "a constraint"
+        fraction = (
+            f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})"
+            if n
+            else ""
+        )
         needed = f"{100.0 * MIN_CONTACT_SHARE:g} %"
         return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
 
@@ -403,15 +477,23 @@ class StepSizes:
         """Median and maximum number of rows and contacts, and the fraction of steps that have any."""
         rows = [
             (name, f"{x['median']:g}", x["maximum"], f"{100.0 * x['share']:.1f} %")
-            for name in ("rows", "contacts") if (x := self.as_dict[name])["median"] is not None
-        ]  # fmt: skip
+            for name in ("rows", "contacts")
+            if (x := self.as_dict[name])["median"] is not None
+        ]
         return pd.DataFrame(rows, columns=["in a step", "median", "maximum", "steps with any"])
 
     @property
     def as_dict(self) -> dict[str, Any]:
         """The contents of `table` for numbers.json."""
-        numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
+        numbers: dict[str, Any] = {
+            "can_touch": self.can_touch,
+            "min_contact_share": MIN_CONTACT_SHARE,
+        }
         for name, x in (("rows", self.rows), ("contacts", self.contacts)):
-            found = (float(np.median(x)), int(x.max()), float(np.mean(x > 0))) if len(x) else (None,) * 3
+            found = (
+                (float(np.median(x)), int(x.max()), float(np.mean(x > 0)))
+                if len(x)
+                else (None,) * 3
+            )
             numbers[name] = dict(zip(("median", "maximum", "share"), found, strict=True))
         return numbers

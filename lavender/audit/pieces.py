@@ -19,7 +19,12 @@ from lavender.problem import Problem
 
 AUDIT_VERDICTS = (*VERDICTS, "not judged")
 NOT_JUDGED = len(VERDICTS)
-WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # Errors of the worst row [m/s, N s, -, -].
+WORST_ROW_ERRORS = (
+    "velocity",
+    "impulse",
+    "relative",
+    "floor",
+)  # Errors of the worst row [m/s, N s, -, -].
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 # Numbers of contacts differ between steps and are removed from the names of rows.
 CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
@@ -45,7 +50,9 @@ class Prediction(NamedTuple):
     first: tuple[int, int] | None = None  # (world, step): the first of these steps.
 
     @classmethod
-    def of_steps(cls, predicted: FloatArray, after: FloatArray, world: Any, step: Any) -> Prediction:
+    def of_steps(
+        cls, predicted: FloatArray, after: FloatArray, world: Any, step: Any
+    ) -> Prediction:
         """Compare velocities (n, nv) of steps; those with a NaN are not compared."""
         gap = np.abs(predicted - after).max(axis=1, initial=0.0)
         size = np.maximum(np.abs(predicted), np.abs(after)).max(axis=1, initial=0.0)
@@ -79,7 +86,9 @@ class Worst:
     where: str  # Name of the row with this error.
     problem: Problem = field(repr=False)
     impulse: FloatArray = field(repr=False)  # (m,) N s: the engine's answer.
-    state: dict[str, FloatArray] = field(repr=False)  # State before the step, by the engine's names.
+    state: dict[str, FloatArray] = field(
+        repr=False
+    )  # State before the step, by the engine's names.
 
 
 class Piece(NamedTuple):
@@ -112,14 +121,19 @@ class Piece(NamedTuple):
     def of_lost_steps(cls, world: int, step: Any, divergence: Divergence) -> Piece:
         """Make the piece of the steps of a world after it diverged."""
         k = len(step)
-        numbers, zeros = np.full((len(WORST_ROW_ERRORS), k), np.nan), np.zeros(k, int)
+        numbers = np.full((len(WORST_ROW_ERRORS), k), np.nan)
+        zeros = np.zeros(k, int)
         verdict = np.full(k, NOT_JUDGED, np.int8)
         worlds = np.full(k, world)
         return cls(worlds, step, numbers, verdict, zeros, zeros, [], [], divergences=[divergence])
 
 
 def judge_steps(
-    frame: Frame, judging: Judging, world: Any, step: Any, state_of: Callable[[int], dict[str, FloatArray]]
+    frame: Frame,
+    judging: Judging,
+    world: Any,
+    step: Any,
+    state_of: Callable[[int], dict[str, FloatArray]],
 ) -> Piece:
     """Judge the engine's answers to the problems of a frame, one for each step.
 
@@ -136,23 +150,38 @@ def judge_steps(
         verdict[measured & (verdicts == word)] = i
     numbers[:, verdict == NOT_JUDGED] = np.nan
     rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in (frame.rows, frame.contacts))
-    unconverged = np.flatnonzero(np.isin(verdict, [VERDICTS.index(UNCONVERGED), VERDICTS.index(WRONG)]))
+    unconverged = np.flatnonzero(
+        np.isin(verdict, [VERDICTS.index(UNCONVERGED), VERDICTS.index(WRONG)])
+    )
     judged = {int(i): r[int(i)] for i in unconverged}
     order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
     if judging.keep is None:
         order = order[np.sort(np.unique(world[order], return_index=True)[1])]
-    flat, worst = frame.impulse.reshape(-1), []
+    flat = frame.impulse.reshape(-1)
+    worst = []
     for i in order[: N_WORST_WORLDS if judging.keep is None else judging.keep].tolist():
-        impulse, name = flat[batch.rows_of(i)].copy(), judged[i].worst_label
+        impulse = flat[batch.rows_of(i)].copy()
+        name = judged[i].worst_label
         at = float(numbers[0, i]), int(world[i]), int(step[i])
         worst.append(Worst(*at, name, batch[i], impulse, state_of(i)))
     with_contact = np.flatnonzero(contacts > 0)
     n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
     chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
     return Piece(
-        world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, worst=worst,
-        where=[(i, CONTACT_NUMBER.sub(r"\1 ", one.worst_label).strip()) for i, one in judged.items()],
-        contact_states=[StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()],
-        converged=frame.converged, n_dropped=frame.n_dropped,
+        world,
+        step,
+        numbers,
+        verdict=verdict,
+        rows=rows,
+        contacts=contacts,
+        worst=worst,
+        where=[
+            (i, CONTACT_NUMBER.sub(r"\1 ", one.worst_label).strip()) for i, one in judged.items()
+        ],
+        contact_states=[
+            StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()
+        ],
+        converged=frame.converged,
+        n_dropped=frame.n_dropped,
         lost_digits=[(x.lost_digits, x.acceleration_error) for x in r.without_digits.values()],
-    )  # fmt: skip
+    )

@@ -16,9 +16,13 @@ from lavender.io.start_states import hash_model
 
 # Packages of the engines by their names in `audit`; "mujoco" compiles the models of most of them.
 PACKAGES = {
-    "mujoco": "mujoco", "mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp", "kamino": "newton",
-    "newton-mujoco": "newton", "genesis": "genesis-world",
-}  # fmt: skip
+    "mujoco": "mujoco",
+    "mjx": "mujoco-mjx",
+    "mujoco_warp": "mujoco-warp",
+    "kamino": "newton",
+    "newton-mujoco": "newton",
+    "genesis": "genesis-world",
+}
 N_HASH_DIGITS = 12
 
 
@@ -28,25 +32,37 @@ def describe_provenance(model: Any, name: str, engine: str = "mujoco") -> dict[s
     engine, engine_version, lavender, mujoco, integrator, solver, cone, timestep [s], model, model_hash (of the arrays
     and options of the model), date (UTC) and command; an entry that the run does not have is None.
     """
-    version, program = None, Path(sys.argv[0])
+    version = None
+    program = Path(sys.argv[0])
     with contextlib.suppress(metadata.PackageNotFoundError):
         version = metadata.version(PACKAGES.get(engine, engine))
     is_lavender = program.stem == "lavender" or program.parts[-2:] == ("lavender", "__main__.py")
     entries: dict[str, Any] = {
-        "engine": engine, "engine_version": version, "lavender": __version__,
-        "mujoco": None, "integrator": None, "solver": None, "cone": None, "timestep": None, "model": name,
-        "model_hash": None, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "engine": engine,
+        "engine_version": version,
+        "lavender": __version__,
+        "mujoco": None,
+        "integrator": None,
+        "solver": None,
+        "cone": None,
+        "timestep": None,
+        "model": name,
+        "model_hash": None,
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "command": shlex.join(["lavender", *sys.argv[1:]]) if is_lavender else None,
-    }  # fmt: skip
+    }
     if model is not None:
         import mujoco as mj
 
         integrator = mj.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_")
-        entries |= {name: get_option_value(mj, model, name) for name in ("solver", "cone", "timestep")}
         entries |= {
-            "mujoco": mj.__version__, "integrator": "Euler" if integrator == "EULER" else integrator.lower(),
+            name: get_option_value(mj, model, name) for name in ("solver", "cone", "timestep")
+        }
+        entries |= {
+            "mujoco": mj.__version__,
+            "integrator": "Euler" if integrator == "EULER" else integrator.lower(),
             "model_hash": hash_model(model, options=True)[:N_HASH_DIGITS],
-        }  # fmt: skip
+        }
     return entries
 
 

@@ -30,16 +30,26 @@ from lavender.base.lazy_import import pandas as pd
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
-from lavender.report.text import format_count, format_percent, format_size, format_speed, split_row_unit
+from lavender.report.text import (
+    format_count,
+    format_percent,
+    format_size,
+    format_speed,
+    split_row_unit,
+)
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
 SAVED_KINDS = ("worst", "contact")
 #: Outcomes of a step of an engine that claims that its solve converged, or that it did not.
 OUTCOMES = (
-    "claimed and right", "claimed and wrong", "not claimed but right", "not claimed and wrong",
-    "claimed with numbers that are not finite", "not claimed, not finite",
-)  # fmt: skip
+    "claimed and right",
+    "claimed and wrong",
+    "not claimed but right",
+    "not claimed and wrong",
+    "claimed with numbers that are not finite",
+    "not claimed, not finite",
+)
 
 
 @dataclass(eq=False)
@@ -56,7 +66,9 @@ class Audit:
     rows: Any
     contacts: Any
     can_touch: bool = True  # Whether the model has geoms that can collide.
-    threshold: float = DEFAULT_THRESHOLD  # [m/s] Velocity error up to which an answer is close enough.
+    threshold: float = (
+        DEFAULT_THRESHOLD  # [m/s] Velocity error up to which an answer is close enough.
+    )
     # [m/s] The headline counts the steps with a larger velocity error that rounding does not explain.
     error_limit: float | None = None
     # Sentences about the differences from a simulation of the model as it is, and warnings.
@@ -102,8 +114,11 @@ class Audit:
     def add_piece(self, piece: Piece, keep: int | None) -> None:
         """Add the results of judged steps, and keep the worst (`Judging.keep`)."""
         # Enlarge the arrays for steps of a loop of unknown length and number of worlds.
-        size, at = self.verdict.shape, (piece.world, piece.step)
-        worlds, steps = (max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, at, strict=True))
+        size = self.verdict.shape
+        at = (piece.world, piece.step)
+        worlds, steps = (
+            max(n, int(np.max(x, initial=-1)) + 1) for n, x in zip(size, at, strict=True)
+        )
         if (worlds, steps) != size:
             more = ((0, worlds - size[0]), (0, steps - size[1]))
             self.numbers = np.pad(self.numbers, ((0, 0), *more), constant_values=np.nan)
@@ -113,7 +128,11 @@ class Audit:
                 self.converged = np.pad(self.converged, more, constant_values=-1)
             self.runs = replace(self.runs, worlds=worlds, steps=steps)
         self.numbers[:, piece.world, piece.step] = piece.numbers
-        self.verdict[at], self.rows[at], self.contacts[at] = piece.verdict, piece.rows, piece.contacts
+        self.verdict[at], self.rows[at], self.contacts[at] = (
+            piece.verdict,
+            piece.rows,
+            piece.contacts,
+        )
         if self.converged is not None and piece.converged is not None:
             self.converged[at] = piece.converged
         for i, name in piece.where:
@@ -210,7 +229,9 @@ class Audit:
         """
         selection = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
         verdict = self.verdict[selection]
-        close = (verdict == AUDIT_VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
+        close = (verdict == AUDIT_VERDICTS.index(CLOSE)) & (
+            self.numbers[0][selection] <= DEFAULT_THRESHOLD
+        )
         return bool(np.all(close | (verdict == AUDIT_VERDICTS.index(AT_FLOOR))))
 
     # -- sentences -----------------------------------------------------------------------------------------
@@ -249,7 +270,9 @@ class Audit:
                 "because R of a row is far below the diagonal of J M^-1 J^T."
             )
             if lost["moved_by_forces"]:
-                exact = f"The acceleration is exact to {format_size(lost['acceleration_error'])} m/s"
+                exact = (
+                    f"The acceleration is exact to {format_size(lost['acceleration_error'])} m/s"
+                )
                 text += f" {exact}; the steps, which use the forces, are not."
             lines.append(text)
         if self.engine_warnings:
@@ -261,16 +284,23 @@ class Audit:
     def _count_lost_digits(self) -> dict[str, Any]:
         """Count the steps with forces that have lost digits; `acceleration_error` is the largest one [m/s]."""
         errors = [error for _, error in self.lost_digits if np.isfinite(error)]
-        return {"steps": len(self.lost_digits), "digits": max((n for n, _ in self.lost_digits), default=0.0),
-                "moved_by_forces": len(errors), "acceleration_error": max(errors, default=0.0)}  # fmt: skip
+        return {
+            "steps": len(self.lost_digits),
+            "digits": max((n for n, _ in self.lost_digits), default=0.0),
+            "moved_by_forces": len(errors),
+            "acceleration_error": max(errors, default=0.0),
+        }
 
     def compare_in_words(self) -> str:
         """Return a sentence with the counts of the other model on the same states; empty without one."""
         if self.against is None:
             return ""
-        other, both = self.against, self.is_judged & self.against.is_judged
+        other = self.against
+        both = self.is_judged & self.against.is_judged
         own, its = (x.numbers[0][both] for x in (self, other))
-        better, worse, n = int((own < its).sum()), int((own > its).sum()), int(both.sum())
+        better = int((own < its).sum())
+        worse = int((own > its).sum())
+        n = int(both.sum())
         less, more = (format_percent(x, max(n, 1), 1) for x in (better, worse))
         return (
             f"Against {other.runs.name}, on the same {format_count(n, 'state')}: the error is smaller in {less} of the "
@@ -283,10 +313,13 @@ class Audit:
     @property
     def errors(self) -> pd.DataFrame:
         """Quantiles of the errors over all steps judged, and over unconverged and wrong ones."""
-        return _tabulate_quantiles({
-            "velocity [m/s]": self.numbers[0][self.is_judged], "impulse [N s]": self.numbers[1][self.is_judged],
-            "velocity, unconverged [m/s]": self.numbers[0][self.is_unconverged],
-        })  # fmt: skip
+        return _tabulate_quantiles(
+            {
+                "velocity [m/s]": self.numbers[0][self.is_judged],
+                "impulse [N s]": self.numbers[1][self.is_judged],
+                "velocity, unconverged [m/s]": self.numbers[0][self.is_unconverged],
+            }
+        )
 
     @property
     def worst_rows(self) -> pd.DataFrame:
@@ -301,11 +334,18 @@ class Audit:
     def diverged(self) -> pd.DataFrame:
         """The step in which each world diverged."""
         rows = [
-            (d.cause, d.world, d.step, float(self.numbers[0, d.world, d.step]),
-             "exact" if self.has_exact_solves(d) else "not exact")
+            (
+                d.cause,
+                d.world,
+                d.step,
+                float(self.numbers[0, d.world, d.step]),
+                "exact" if self.has_exact_solves(d) else "not exact",
+            )
             for d in self.divergences
-        ]  # fmt: skip
-        return pd.DataFrame(rows, columns=["too large", "world", "step", "error [m/s]", "solves until then"])
+        ]
+        return pd.DataFrame(
+            rows, columns=["too large", "world", "step", "error [m/s]", "solves until then"]
+        )
 
     @property
     def worst_steps(self) -> pd.DataFrame:
@@ -319,16 +359,26 @@ class Audit:
     @property
     def claims(self) -> pd.DataFrame:
         """Number of steps and worlds with each outcome of a claim, and errors."""
-        rows, outcome = [], self.outcome
+        rows = []
+        outcome = self.outcome
         for i, name in enumerate(OUTCOMES):
             here = outcome == i
             n = int(here.sum())
             if n:
                 errors = self.numbers[0][here & self.is_judged]
-                sizes = np.quantile(errors, (0.5, 1.0)).tolist() if len(errors) else [np.nan, np.nan]
+                sizes = (
+                    np.quantile(errors, (0.5, 1.0)).tolist() if len(errors) else [np.nan, np.nan]
+                )
                 share = format_percent(n, int((outcome >= 0).sum()), 1)
                 rows.append((name, n, share, int(np.count_nonzero(here.any(axis=1))), *sizes))
-        heads = ["claim and verdict", "steps", "share", "worlds", "median [m/s]", "largest error [m/s]"]
+        heads = [
+            "claim and verdict",
+            "steps",
+            "share",
+            "worlds",
+            "median [m/s]",
+            "largest error [m/s]",
+        ]
         return pd.DataFrame(rows, columns=heads)
 
     @property
@@ -336,9 +386,12 @@ class Audit:
         """Errors and counts of this model and of the other one on the same states."""
         if self.against is None:
             return pd.DataFrame()
-        other, both = self.against, self.is_judged & self.against.is_judged
+        other = self.against
+        both = self.is_judged & self.against.is_judged
         names = f"{self.runs.name} [m/s]", f"against {other.runs.name} [m/s]"
-        return _tabulate_quantiles({names[0]: self.numbers[0][both], names[1]: other.numbers[0][both]})
+        return _tabulate_quantiles(
+            {names[0]: self.numbers[0][both], names[1]: other.numbers[0][both]}
+        )
 
     # -- files ---------------------------------------------------------------------------------------------
 
@@ -360,7 +413,9 @@ class Audit:
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
         records |= {"rows": self.rows, "contacts": self.contacts}
-        records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
+        records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(
+            -1, 2
+        )
         if self.converged is not None:
             records["converged"] = self.converged
         if self.against is not None:
@@ -380,7 +435,10 @@ class Audit:
         kept: Sequence[Worst | StepState] = self.worst if kind == "worst" else self.contact_states
         names = kept[0].state if kept else ()
         arrays = {name: np.array([entry.state[name] for entry in kept]) for name in names}
-        labels = {name: np.array([getattr(entry, name) for entry in kept], int) for name in ("world", "step")}
+        labels = {
+            name: np.array([getattr(entry, name) for entry in kept], int)
+            for name in ("world", "step")
+        }
         write_arrays(Path(path), arrays | labels)
         return len(kept)
 
@@ -390,18 +448,33 @@ class Audit:
         runs, unconverged = self.runs, self.is_unconverged
         divergences = [d._asdict() | {"exact": self.has_exact_solves(d)} for d in self.divergences]
         totals = {
-            "head": self.headline, "notes": self.advice, "engine": self.engine, "model": runs.name,
-            "worlds": runs.worlds, "steps": runs.steps, "seed": runs.seed, "spread": runs.spread,
-            "threshold": self.threshold, "judged": self.n_judged, "unjudged": self.n_unjudged,
-            "diverged": self.n_diverged, "unconverged": int(unconverged.sum()),
+            "head": self.headline,
+            "notes": self.advice,
+            "engine": self.engine,
+            "model": runs.name,
+            "worlds": runs.worlds,
+            "steps": runs.steps,
+            "seed": runs.seed,
+            "spread": runs.spread,
+            "threshold": self.threshold,
+            "judged": self.n_judged,
+            "unjudged": self.n_unjudged,
+            "diverged": self.n_diverged,
+            "unconverged": int(unconverged.sum()),
             "wrong": int((self.verdict == AUDIT_VERDICTS.index(WRONG)).sum()),
-            "worlds_unconverged": int(unconverged.any(axis=1).sum()), "largest": self.max_velocity_error,
-            "error_limit": self.error_limit, "above_limit": self.n_above_limit, "dropped_rows": self.n_dropped,
-            "divergences": divergences, **self.judged_sizes.as_dict,
-            "engine_warnings": dict(self.engine_warnings), "stopped": self.is_stopped,
+            "worlds_unconverged": int(unconverged.any(axis=1).sum()),
+            "largest": self.max_velocity_error,
+            "error_limit": self.error_limit,
+            "above_limit": self.n_above_limit,
+            "dropped_rows": self.n_dropped,
+            "divergences": divergences,
+            **self.judged_sizes.as_dict,
+            "engine_warnings": dict(self.engine_warnings),
+            "stopped": self.is_stopped,
             "provenance": self.provenance,
-            "prediction": self.prediction._asdict(), "lost_digits": self._count_lost_digits(),
-        }  # fmt: skip
+            "prediction": self.prediction._asdict(),
+            "lost_digits": self._count_lost_digits(),
+        }
         if self.converged is not None:
             totals["claims"] = self.claim_counts
         if self.against is not None:
@@ -422,5 +495,7 @@ class Audit:
 def _tabulate_quantiles(errors: dict[str, Any]) -> pd.DataFrame:
     """Build the table of `QUANTILES` of some errors; columns without a finite error are left out."""
     known = {name: x[np.isfinite(x)] for name, x in errors.items()}
-    columns = {name: np.quantile(x, QUANTILES, method="higher") for name, x in known.items() if len(x)}
+    columns = {
+        name: np.quantile(x, QUANTILES, method="higher") for name, x in known.items() if len(x)
+    }
     return pd.DataFrame({"quantile": QUANTILE_NAMES, **columns} if columns else {})

@@ -21,15 +21,21 @@ class MujocoSetting:
     """Attributes of MuJoCo's `<option>` that differ from the model's."""
 
     options: tuple[tuple[str, Any], ...] = ()  # tuple of (str, value)
-    is_default: bool = field(default=False, compare=False)  # Whether these are MuJoCo's default options.
-    iterations: int = field(default=0, compare=False)  # Iteration limit, also if it is the model's own.
+    is_default: bool = field(
+        default=False, compare=False
+    )  # Whether these are MuJoCo's default options.
+    iterations: int = field(
+        default=0, compare=False
+    )  # Iteration limit, also if it is the model's own.
 
     @classmethod
     def from_options(cls, mj: Any, model: Any, **options: Any) -> MujocoSetting:
         """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
         has = {name: get_option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
         return cls(
-            tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]),
+            tuple(
+                (name, options[name]) for name in has if options.get(name, has[name]) != has[name]
+            ),
             iterations=options.get("iterations", has["iterations"]),
         )
 
@@ -50,13 +56,18 @@ class MujocoSetting:
         configured = copy.copy(model)
         for name, x in self.options:
             kind = ENUMS.get(name)
-            setattr(configured.opt, name, x if kind is None else _map_keywords_to_values(mj, name)[x])
+            setattr(
+                configured.opt, name, x if kind is None else _map_keywords_to_values(mj, name)[x]
+            )
         return configured
 
     @property
     def option_line(self) -> str:
         """`<option>` line to copy into the model; empty if no option differs."""
-        texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
+        texts = (
+            f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"'
+            for name, x in self.options
+        )
         return f"<option {' '.join(texts)}/>" if self.options else ""
 
 
@@ -73,4 +84,6 @@ def get_option_value(mj: Any, model: Any, name: str) -> Any:
     x = getattr(model.opt, name)
     if name not in ENUMS:
         return float(x) if isinstance(x, float) else int(x)
-    return next(word for word, value in _map_keywords_to_values(mj, name).items() if int(value) == int(x))
+    return next(
+        word for word, value in _map_keywords_to_values(mj, name).items() if int(value) == int(x)
+    )

@@ -50,8 +50,13 @@ START_FIELDS = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_qua
 ACCELERATION_FIELDS = ("qacc_smooth", "qfrc_smooth", "qacc")  # Arrays of each step for `from_efc`.
 STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # Arrays on which a step depends.
 # mjtConstraint -> name of a block that is not a contact.
-BLOCK_KINDS = {0: "equality", 1: "friction loss", 2: "friction loss", 3: "limit of a joint",
-               4: "limit of a tendon"}  # fmt: skip
+BLOCK_KINDS = {
+    0: "equality",
+    1: "friction loss",
+    2: "friction loss",
+    3: "limit of a joint",
+    4: "limit of a tendon",
+}
 PYRAMIDAL_CONTACT = 6  # Value of mjtConstraint of an edge of a pyramidal contact.
 MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
 SLEEP_NOTE = (
@@ -62,7 +67,12 @@ SLEEP_NOTE = (
 WARNING_NUMBER = re.compile(r"\d+")
 
 
-SPREADS = (0.1, 0.01, 0.001, 0.0)  # [m/s, rad/s] Default: the largest one with which no trial world diverges.
+SPREADS = (
+    0.1,
+    0.01,
+    0.001,
+    0.0,
+)  # [m/s, rad/s] Default: the largest one with which no trial world diverges.
 N_TRIAL_WORLDS = 3
 
 
@@ -83,7 +93,9 @@ class Runs:
     starts: StartStates | None = None  # States in which the worlds start; default: the model's own.
     # (str, mujoco.MjModel): name and model of the other model that solves the same steps.
     against: tuple[str, Any] | None = None
-    notes: tuple[str, ...] = ()  # Sentences about the differences from a simulation of the model as it is.
+    notes: tuple[
+        str, ...
+    ] = ()  # Sentences about the differences from a simulation of the model as it is.
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
@@ -94,7 +106,14 @@ class Runs:
 
     @classmethod
     def of_model(
-        cls, source: Any, worlds: int, steps: int, *, states: Any = None, against: Any = None, **more: Any
+        cls,
+        source: Any,
+        worlds: int,
+        steps: int,
+        *,
+        states: Any = None,
+        against: Any = None,
+        **more: Any,
     ) -> Runs:
         """Make the runs of a model, without sleep.
 
@@ -186,7 +205,9 @@ class Runs:
             state = self.starts.vectors[world % len(self.starts)]
             mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
         if world >= self.n_exact_worlds:
-            data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(model.nv)
+            data.qvel[:] += self.spread * np.random.default_rng([self.seed, world]).standard_normal(
+                model.nv
+            )
         return data
 
     def make_controller(self, world: int) -> Any:
@@ -201,7 +222,9 @@ class Runs:
 
 def can_any_geoms_collide(mj: Any, model: Any) -> bool:
     """Whether any two geoms of the model can collide."""
-    if model.opt.disableflags & (mj.mjtDisableBit.mjDSBL_CONTACT | mj.mjtDisableBit.mjDSBL_CONSTRAINT):
+    if model.opt.disableflags & (
+        mj.mjtDisableBit.mjDSBL_CONTACT | mj.mjtDisableBit.mjDSBL_CONSTRAINT
+    ):
         return False
     if model.npair or model.nflex:
         return True
@@ -209,7 +232,9 @@ def can_any_geoms_collide(mj: Any, model: Any) -> bool:
     kinds, counts = np.unique(bit_masks, axis=0, return_counts=True)
     matches = kinds[:, :1] & kinds[:, 1]
     matches |= matches.T
-    return bool(np.any(matches[~np.eye(len(kinds), dtype=bool)]) or np.any(np.diag(matches)[counts > 1]))
+    return bool(
+        np.any(matches[~np.eye(len(kinds), dtype=bool)]) or np.any(np.diag(matches)[counts > 1])
+    )
 
 
 class Divergence(NamedTuple):
@@ -228,7 +253,9 @@ class Frame(NamedTuple):
 
     batch: Batch
     impulse: FloatArray  # [N s]
-    state: dict[str, FloatArray]  # dict of (worlds, ...): state before the step, by the names of MjData.
+    state: dict[
+        str, FloatArray
+    ]  # dict of (worlds, ...): state before the step, by the names of MjData.
     rows: np.ndarray  # (worlds,) int: number of rows that are not padding.
     contacts: np.ndarray  # (worlds,) int: number of contacts with rows that are not padding.
     converged: np.ndarray | None = None  # (worlds,) bool: the engine's claims.
@@ -255,7 +282,9 @@ def count_engine_warnings(mj: Any) -> Iterator[Counter[str]]:
     """Count MuJoCo's warnings by their first sentence instead of printing them, with N for each number."""
     counts: Counter[str] = Counter()
     handler = mj.get_mju_user_warning()
-    mj.set_mju_user_warning(lambda text: counts.update([WARNING_NUMBER.sub("N", text.partition(". ")[0])]))
+    mj.set_mju_user_warning(
+        lambda text: counts.update([WARNING_NUMBER.sub("N", text.partition(". ")[0])])
+    )
     try:
         yield counts
     finally:
@@ -274,7 +303,9 @@ def simulate_world(runs: Runs, world: int) -> tuple[FloatArray, Divergence | Non
     after : (steps, nv), m/s, rad/s
         Velocities after each step; NaN from the step on in which the world diverged.
     """
-    mj, model, kind = runs.mj, runs.model, runs.mj.mjtState.mjSTATE_INTEGRATION
+    mj = runs.mj
+    model = runs.model
+    kind = runs.mj.mjtState.mjSTATE_INTEGRATION
     data, drive = runs.create_start_data(world), runs.make_controller(world)
     states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
     after = np.full((runs.steps, model.nv), np.nan)
@@ -323,12 +354,15 @@ def _find_cause_of_reset(
 
 def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterator[Frame]:
     """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step."""
-    mj, model = runs.mj, copy.copy(runs.model)
+    mj = runs.mj
+    model = copy.copy(runs.model)
     model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
     starts = [runs.create_start_data(world) for world in range(runs.worlds)]
     drives = [runs.make_controller(world) for world in range(runs.worlds)]
     names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
-    start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
+    start_arrays = {
+        name: np.array([getattr(d, name) for d in starts], np.float32) for name in names
+    }
     not_accepted = f"engine {engine!r} does not accept {runs.name}"
     try:
         step: Any
@@ -338,19 +372,25 @@ def iterate_frames(engine: str, runs: Runs, njmax: int | None = None) -> Iterato
             step = WarpWorlds(mj, model, start_arrays, njmax)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
-        raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
+        raise InputError(
+            f"engine {engine!r} cannot be imported ({error}): pip install {package}"
+        ) from None
     except (NotImplementedError, ValueError) as error:
         raise InputError(f"{not_accepted}: {error}") from None
     for k in range(runs.steps):
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
         try:
             arrays = step(ctrl)
-        except NotImplementedError as error:  # By MJX in the first step, for example for an integrator.
+        except (
+            NotImplementedError
+        ) as error:  # By MJX in the first step, for example for an integrator.
             raise InputError(f"{not_accepted}: {error}") from None
         yield make_frame(mj, model, *arrays)._replace(n_dropped=getattr(step, "n_dropped", 0))
 
 
-def make_frame(mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any) -> Frame:
+def make_frame(
+    mj: Any, model: Any, state: Any, efc: Any, mass: Any, contact: Any, extra: Any
+) -> Frame:
     """Build the frame of a step of all worlds from the engine's arrays.
 
     Parameters
@@ -413,19 +453,26 @@ def _make_mjx_stepper(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
         """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
         nonlocal data
         before, now, data = step_worlds(data, ctrl)
-        e, n = now._impl, len(ctrl)
-        efc = {name: np.asarray(getattr(e, f"efc_{name}")) for name in
-               ("J", "D", "aref", "type", "frictionloss", "force")}  # fmt: skip
+        e = now._impl
+        n = len(ctrl)
+        efc = {
+            name: np.asarray(getattr(e, f"efc_{name}"))
+            for name in ("J", "D", "aref", "type", "frictionloss", "force")
+        }
         c = e.contact
         address = np.broadcast_to(np.asarray(c.efc_address), (n, np.shape(c.dist)[1]))
         size = address.shape[1]
         contact = (
-            np.repeat(np.arange(n), size), address.ravel(), _concatenate_worlds(c.dim, n, size),
+            np.repeat(np.arange(n), size),
+            address.ravel(),
+            _concatenate_worlds(c.dim, n, size),
             _concatenate_worlds(c.friction, n, size, 5),
             _concatenate_worlds(c.geom, n, size, 2),
-        )  # fmt: skip
+        )
         state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
-        extra: dict[str, Any] = {name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS}
+        extra: dict[str, Any] = {
+            name: np.asarray(getattr(now, name)) for name in ACCELERATION_FIELDS
+        }
         extra["moved_by"] = "acceleration" if uses_acceleration else "forces"
         return state, efc, np.asarray(e.M), contact, extra
 
@@ -453,13 +500,20 @@ class WarpWorlds:
         `n_dropped`. Default: memory grows with the rows, and nothing is dropped.
     """
 
-    def __init__(self, mj: Any, model: Any, start_arrays: dict[str, Any], njmax: int | None = None) -> None:
+    def __init__(
+        self, mj: Any, model: Any, start_arrays: dict[str, Any], njmax: int | None = None
+    ) -> None:
         import mujoco_warp as mjw
         import warp as wp
 
         wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
-        self.mj, self.mjw, self.wp, self.model, self.n_dropped = mj, mjw, wp, model, 0
-        self.n, self.can_grow = len(start_arrays["qpos"]), njmax is None
+        self.mj = mj
+        self.mjw = mjw
+        self.wp = wp
+        self.model = model
+        self.n_dropped = 0
+        self.n = len(start_arrays["qpos"])
+        self.can_grow = njmax is None
         self.first, start = mj.MjData(model), mj.MjData(model)
         mj.mj_forward(model, start)
         self.rows = njmax or max(MIN_WARP_ROWS, 2 * int(start.nefc))
@@ -493,7 +547,8 @@ class WarpWorlds:
             # A `forward` before the step would change it: rows of welds contain velocities of the last pass.
             (self.mjw.forward if self.is_rk4 else self.mjw.step)(self.device_model, self.data)
             # The engine counts the rows and contacts that it has no memory for, too.
-            needed, contacts = int(self.data.nefc.numpy().max()), int(self.data.nacon.numpy()[0])
+            needed = int(self.data.nefc.numpy().max())
+            contacts = int(self.data.nacon.numpy()[0])
             fits_contacts = contacts <= self.n * self.contacts
             if (needed <= self.rows and fits_contacts) or not self.can_grow:
                 excess = np.maximum(self.data.nefc.numpy() - self.rows, 0).sum()
@@ -511,8 +566,10 @@ class WarpWorlds:
         state = {name: before[name] for name in STEP_FIELDS}
         data, rows = self.data, self.rows
         e, c = data.efc, data.contact
-        efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
-               ("D", "aref", "type", "frictionloss", "force")}  # fmt: skip
+        efc = {
+            name: getattr(e, name).numpy()[:, :rows].copy()
+            for name in ("D", "aref", "type", "frictionloss", "force")
+        }
         efc["J"] = e.J.numpy()[:, :rows, : self.model.nv].copy()
         parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
         world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
@@ -538,10 +595,13 @@ def _make_block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, co
         """Return the names of the blocks of world i."""
         types = np.broadcast_to(row_types, (len(batch), row_types.shape[-1]))[i]
         first = {int(address[k]): k for k in np.flatnonzero((world_of == i) & (address >= 0))}
-        names, name, first_row = [], "contact", 0
+        names = []
+        name = "contact"
+        first_row = 0
         for row in batch._get_cones_of_world(i).ptr[:-1].tolist():
             if row in first:
-                name, first_row = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
+                name = f"contact ({', '.join(map(geom_name, geom[first[row]]))})"
+                first_row = row
             edge = f", edge {row - first_row}" if int(types[row]) == PYRAMIDAL_CONTACT else ""
             names.append(BLOCK_KINDS.get(int(types[row]), name + edge))
         return names

@@ -42,9 +42,12 @@ from lavender.solving.solve import solve
 
 #: {variant: cause of its difference from the next variant}, in the order of replacement.
 CAUSES = {
-    "engine": "unfinished solving", "solved": "shape of the cone", "disk": "softness of friction",
-    "hard": "convex relaxation", "coulomb": "sliding at the friction limit",
-}  # fmt: skip
+    "engine": "unfinished solving",
+    "solved": "shape of the cone",
+    "disk": "softness of friction",
+    "hard": "convex relaxation",
+    "coulomb": "sliding at the friction limit",
+}
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
@@ -105,9 +108,14 @@ class Remedy:
         touches = np.isfinite(speeds[:, 1:])
         later = np.nan if diverged_step >= 0 else compute_mean(speeds[:, 1:])
         return cls(
-            setting, compute_mean(speeds[:, 0]), later, diverged_step, float(touches.mean()), int(touches[:, -1].sum()),
+            setting,
+            compute_mean(speeds[:, 0]),
+            later,
+            diverged_step,
+            float(touches.mean()),
+            int(touches[:, -1].sum()),
             tuple(map(compute_mean, speeds.T)),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +124,9 @@ class SlipExplanation:
 
     contacts: tuple[str, ...]  # Names of the chosen contacts.
     variants: tuple[SlipVariant, ...]  # In the order of replacement.
-    speeds_before: FloatArray | None = None  # (contacts,) m/s: sliding speed before the step, if it is known.
+    speeds_before: FloatArray | None = (
+        None  # (contacts,) m/s: sliding speed before the step, if it is known.
+    )
     # (contacts,): friction force of the engine's answer divided by mu times the normal force, if it is known.
     friction_use: FloatArray | None = None
     # Settings that were simulated, if the model is known and this is its state with the fastest contact.
@@ -143,7 +153,12 @@ class SlipExplanation:
     @property
     def slips(self) -> pd.DataFrame:
         """Slip of each contact and its parts by cause [m/s], and the dominant cause."""
-        columns = {"contact": self.contacts, "points": 1, "speed": self.variants[0].speeds, **self.parts}
+        columns = {
+            "contact": self.contacts,
+            "points": 1,
+            "speed": self.variants[0].speeds,
+            **self.parts,
+        }
         return _add_dominant_cause(pd.DataFrame(columns))
 
     @property
@@ -159,7 +174,9 @@ class SlipExplanation:
     @property
     def remedies_table(self) -> pd.DataFrame:
         """Slip of the fastest contact with each setting [m/s], in the explained step and later, as texts."""
-        slips, means = (format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later"))
+        slips, means = (
+            format_sizes([getattr(r, name) for r in self.remedies]) for name in ("slip", "later")
+        )
         for i, remedy in enumerate(self.remedies):
             if remedy.diverged_step >= 0:
                 means[i] = f"diverges in step {remedy.diverged_step}"
@@ -169,7 +186,9 @@ class SlipExplanation:
         columns = dict(zip(heads, [settings, *texts], strict=True))
         n = self.n_states * REMEDY_STEPS
         columns["steps with contact"] = [f"{r.touching * n:.0f} of {n}" for r in self.remedies]
-        columns["states that keep contact"] = [f"{r.kept} of {self.n_states}" for r in self.remedies]
+        columns["states that keep contact"] = [
+            f"{r.kept} of {self.n_states}" for r in self.remedies
+        ]
         return pd.DataFrame(columns)
 
     def draw_slip(self, folder: Path) -> str:
@@ -190,7 +209,9 @@ class SlipExplanation:
                     drawn.add(finite.tobytes())
                     axes.plot(remedy.speeds, **style)
                     weight = "normal" if labels else "bold"
-                    labels.append(Label(finite[-1], shorten(remedy.setting), style["color"], weight))
+                    labels.append(
+                        Label(finite[-1], shorten(remedy.setting), style["color"], weight)
+                    )
             axes.set_xlim(0, REMEDY_STEPS)
             axes.set_ylim(bottom=0.0)
             axes.set_xlabel("step")
@@ -219,7 +240,8 @@ class SlipExplanation:
         use = None if self.friction_use is None else float(self.friction_use[i])
         has_force = use is None or not np.isnan(use)
         if self.speeds_before is not None:
-            before, after = float(self.speeds_before[i]), float(self.variants[-1].speeds[i])
+            before = float(self.speeds_before[i])
+            after = float(self.variants[-1].speeds[i])
             lines.append(f"Before the step it slid with {format_size(before)} m/s.")
             if slip["cause"] == CAUSES["coulomb"] and before >= MIN_EARLIER_FRACTION * after:
                 slows = "slows it" if after < before else "does not slow it"
@@ -250,8 +272,11 @@ class SlipExplanation:
         before = get_slip(now)
         time = f"in the next {REMEDY_STEPS} steps" if is_later else "in the same step"
         if not before > MIN_EXPLAINED_SLIP:
-            mean, limit = f"{format_size(before)} m/s as it is", f"{MIN_EXPLAINED_SLIP:g} m/s"
-            return [f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."]
+            mean = f"{format_size(before)} m/s as it is"
+            limit = f"{MIN_EXPLAINED_SLIP:g} m/s"
+            return [
+                f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."
+            ]
         stable = [r for r in self.remedies[1:] if r.diverged_step < 0]
         helpful = [r for r in stable if get_slip(r) <= MAX_REMAINING_SLIP * before]
         if not helpful:
@@ -260,16 +285,25 @@ class SlipExplanation:
         helpful.sort(key=get_slip)
         lost = {
             r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"
-            for r in helpful if r.kept < now.kept
-        }  # fmt: skip
-        lines = [f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}" for r in helpful]
+            for r in helpful
+            if r.kept < now.kept
+        }
+        lines = [
+            f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}"
+            for r in helpful
+        ]
         return [head, *lines]
 
 
 def explain_slip(
-    problem: Problem, impulse: Any, *, contacts: Sequence[int] | Sequence[str] | str | None = None,
-    disk: Problem | None = None, surface_velocity: Any = None, tol: float = 1e-9,
-) -> SlipExplanation:  # fmt: skip
+    problem: Problem,
+    impulse: Any,
+    *,
+    contacts: Sequence[int] | Sequence[str] | str | None = None,
+    disk: Problem | None = None,
+    surface_velocity: Any = None,
+    tol: float = 1e-9,
+) -> SlipExplanation:
     """Divide the slip of contacts after a step into parts by their causes.
 
     Parameters
@@ -323,7 +357,11 @@ def explain_slip(
 
     motion = problem.__dict__.get("engine_motion")
     velocity = problem.velocity(answer)
-    if motion is not None and motion.moved_by == "acceleration" and np.array_equal(motion.impulse, answer):
+    if (
+        motion is not None
+        and motion.moved_by == "acceleration"
+        and np.array_equal(motion.impulse, answer)
+    ):
         velocity = own_free + motion.change
     own_slip = compute_slip(measured, blocks, velocity.ravel(), surface)
     variants = [SlipVariant("engine", own_slip, residual(problem, answer).relative)]
@@ -347,9 +385,13 @@ def explain_slip(
     if disk is None and problem.cones.has_box:
         own_disk = replace(problem, cones=problem.cones.shaped("disk"))
     same = start if own_disk.m == problem.m else None
-    start = solve_and_add_variant("disk", own_disk, same, "cones are round" if own_disk is problem else "")
+    start = solve_and_add_variant(
+        "disk", own_disk, same, "cones are round" if own_disk is problem else ""
+    )
     hard, has_soft_friction = _replace_soft_friction(own_disk, surface)
-    start = solve_and_add_variant("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
+    start = solve_and_add_variant(
+        "hard", hard, start, "" if has_soft_friction else "friction rows are hard"
+    )
     law_note = UNDEFINED_LAW if hard.cones.has_round else ""
     law_note = "the law is Coulomb's" if hard.friction == "coulomb" else law_note
     rigid = hard if law_note else hard.relaxed("coulomb")
@@ -362,7 +404,8 @@ def compute_slip(
     problem: Problem, blocks: Sequence[int], velocity: FloatArray, surface: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Return the tangential velocity of each contact minus the surface's (tangents,) [m/s]."""
-    jacobian, cones = problem.jacobian.tocsr(), problem.cones
+    jacobian = problem.jacobian.tocsr()
+    cones = problem.cones
     starts = [int(cones.ptr[k]) + 1 for k in blocks]
     counts = [min(2, int(cones.n_tangents[k])) for k in blocks]
     rows_of_contacts = [slice(start, start + n) for start, n in zip(starts, counts, strict=True)]
@@ -390,7 +433,9 @@ def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
             chosen.append(int(entry))
         else:
             known = f"give one of the blocks {sliding[:20]}"
-            raise InputError(f"contacts names {entry!r}, which is not a contact with tangents; {known}")
+            raise InputError(
+                f"contacts names {entry!r}, which is not a contact with tangents; {known}"
+            )
     return list(dict.fromkeys(chosen))
 
 
@@ -413,7 +458,11 @@ def _replace_soft_friction(problem: Problem, surface: FloatArray) -> tuple[Probl
     rows = problem.cones.friction_rows
     wanted = surface[rows] - _compute_free_row_velocities(problem)[rows]
     soft = np.zeros(problem.m) if problem.compliance is None else np.array(problem.compliance)
-    rounding = 8.0 * np.finfo(float).eps * (np.abs(problem.b[rows]) + np.abs(wanted) + np.abs(surface[rows]))
+    rounding = (
+        8.0
+        * np.finfo(float).eps
+        * (np.abs(problem.b[rows]) + np.abs(wanted) + np.abs(surface[rows]))
+    )
     if not soft[rows].any() and not (np.abs(problem.b[rows] - wanted) > rounding).any():
         return problem, False
     b = np.array(problem.b)
@@ -429,21 +478,31 @@ def get_geoms(contact: str) -> str:
 
 def _add_dominant_cause(slips: pd.DataFrame) -> pd.DataFrame:
     """Add the largest part of each contact's slip and its cause: `part` [m/s] and `cause`, "no slip" below 1e-6 m/s."""
-    parts, slides = slips[list(CAUSES.values())], slips["speed"] > MIN_EXPLAINED_SLIP
+    parts = slips[list(CAUSES.values())]
+    slides = slips["speed"] > MIN_EXPLAINED_SLIP
     cause = parts.idxmax(axis=1) if len(slips) else slips["contact"]
-    return slips.assign(cause=cause.where(slides, "no slip"), part=parts.max(axis=1).where(slides, 0.0))
+    return slips.assign(
+        cause=cause.where(slides, "no slip"), part=parts.max(axis=1).where(slides, 0.0)
+    )
 
 
 def average_slip(explanations: Iterable[SlipExplanation]) -> pd.DataFrame:
     """Return the slip of each pair of geoms, averaged over its points in several states."""
     slips = pd.concat([explanation.slips for explanation in explanations])
-    groups = slips.drop(columns=["cause", "part"]).groupby(slips["contact"].map(get_geoms), sort=False)
+    groups = slips.drop(columns=["cause", "part"]).groupby(
+        slips["contact"].map(get_geoms), sort=False
+    )
     means = groups.mean(numeric_only=True).assign(points=groups["points"].sum())
     return _add_dominant_cause(means.reset_index())
 
 
 def tabulate_slip(slips: pd.DataFrame) -> pd.DataFrame:
     """Return a table of contacts, with speeds in m/s; a contact without slip has no part."""
-    heads = {"contact": "contact", "points": "points", "speed": "slip [m/s]", "part": "largest part [m/s]",
-             "cause": "cause of this part"}  # fmt: skip
+    heads = {
+        "contact": "contact",
+        "points": "points",
+        "speed": "slip [m/s]",
+        "part": "largest part [m/s]",
+        "cause": "cause of this part",
+    }
     return slips[list(heads)].rename(columns=heads)

@@ -39,7 +39,9 @@ from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
 
-MAX_REMEDY_STATES = 8  # Settings are simulated from up to this many states, those with the largest slip.
+MAX_REMEDY_STATES = (
+    8  # Settings are simulated from up to this many states, those with the largest slip.
+)
 FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one of the settings.
 
 
@@ -83,15 +85,22 @@ class SlipOfStates:
         worst = self.worst
         remedies = [r.__dict__ | {"speeds": list(r.speeds)} for r in worst.remedies]
         numbers = {
-            "states": self.n_states, "explained": len(self.explanations), "state": worst.state,
-            "slip": self.table.to_dict("records"), "remedies": remedies, "provenance": self.provenance,
-        }  # fmt: skip
+            "states": self.n_states,
+            "explained": len(self.explanations),
+            "state": worst.state,
+            "slip": self.table.to_dict("records"),
+            "remedies": remedies,
+            "provenance": self.provenance,
+        }
         tables = [self.table, worst.remedies_table] if remedies else [self.table]
-        return ResultPage(self.make_page, numbers, tables, provenance=format_provenance(self.provenance))
+        return ResultPage(
+            self.make_page, numbers, tables, provenance=format_provenance(self.provenance)
+        )
 
     def make_page(self, folder: Path | None) -> Page:
         """Make the page: the fastest contact with its cause, shares of the causes, slip over time, settings."""
-        worst, slips = self.worst, self.worst.slips
+        worst = self.worst
+        slips = self.worst.slips
         first = slips.loc[slips["speed"].idxmax()]
         verdict = f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
         if first["cause"] != "no slip":
@@ -103,7 +112,13 @@ class SlipOfStates:
         if folder is not None:
             total = float(first[list(CAUSES.values())].sum()) or 1.0
             parts = [
-                (cause, f"var(--s{i})", float(first[cause]) / total, [format_speed(first[cause])], "")
+                (
+                    cause,
+                    f"var(--s{i})",
+                    float(first[cause]) / total,
+                    [format_speed(first[cause])],
+                    "",
+                )
                 for i, cause in enumerate(CAUSES.values())
             ]
             causes = make_shares(parts, title="Causes of this slip")
@@ -120,14 +135,24 @@ class SlipOfStates:
         sentences = [" ".join(worst.sentences), *filter(None, [advice])]
         footer = ["Files: numbers.json, figures/ (PDF, SVG, PNG)."]
         return Page(
-            "lavender slip", source, verdict, sentences, warnings=self.notes, blocks=blocks, footer=footer
+            "lavender slip",
+            source,
+            verdict,
+            sentences,
+            warnings=self.notes,
+            blocks=blocks,
+            footer=footer,
         )
 
 
 def explain_slip_of_states(
-    model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1,
+    model: Any,
+    states: Any = None,
+    *,
+    contacts: Sequence[str] | str | None = None,
+    steps: int = 1,
     watch: Callable[[Event], None] | None = None,
-) -> SlipOfStates:  # fmt: skip
+) -> SlipOfStates:
     """Explain the slip of contacts of a MuJoCo model at given states.
 
     Parameters
@@ -153,7 +178,9 @@ def explain_slip_of_states(
     for entry in entries:
         if model.nflex == 0 and not any(entry in name for name in geoms):
             known = ", ".join(geoms[:8])
-            raise InputError(f"contacts names {entry!r}, which no geom's name contains; geoms are {known}")
+            raise InputError(
+                f"contacts names {entry!r}, which no geom's name contains; geoms are {known}"
+            )
     starts = None if states is None else read_states(mj, model, states)
     vectors = [None] if starts is None else list(starts.vectors)
     misfit = "" if starts is None else starts.misfit
@@ -198,7 +225,9 @@ def _advance(mj: Any, model: Any, vector: FloatArray | None, steps: int) -> Any:
 
 def _is_diverging(mj: Any, data: Any) -> bool:
     """Return whether MuJoCo will restart the simulation in the step of this forward pass."""
-    return not all(np.abs(x).max(initial=0.0) <= mj.mjMAXVAL for x in (data.qpos, data.qvel, data.qacc))
+    return not all(
+        np.abs(x).max(initial=0.0) <= mj.mjMAXVAL for x in (data.qpos, data.qvel, data.qacc)
+    )
 
 
 def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
@@ -217,7 +246,8 @@ def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipEx
     chosen = [blocks[names.index(name)] for name in explanation.contacts]
     slips = compute_slip(measured, chosen, data.qvel, surface)
     # Friction force divided by mu times the normal force; nan without a normal force.
-    use, force = np.full(len(chosen), np.nan), np.empty(6)
+    use = np.full(len(chosen), np.nan)
+    force = np.empty(6)
     for i, name in enumerate(explanation.contacts):
         k = int(name.split()[1])
         mj.mj_contactForce(model, data, k, force)
@@ -259,7 +289,9 @@ def _simulate_remedies(
             steps = [-1]
         step = min((step for step in steps if step >= 0), default=-1)
         remedies.append(Remedy.of_runs(text, np.array([speeds for speeds, _ in results]), step))
-    explanations[fastest] = replace(explanations[fastest], remedies=tuple(remedies), n_states=len(chosen))
+    explanations[fastest] = replace(
+        explanations[fastest], remedies=tuple(remedies), n_states=len(chosen)
+    )
 
 
 def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
@@ -270,7 +302,9 @@ def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
 
 def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None, FloatArray]:
     """Return a step's problem, the one with disks if cones are pyramids, and velocities of the surfaces."""
-    problem, disk, final = adapter.from_mujoco(model, data), None, data
+    problem = adapter.from_mujoco(model, data)
+    disk = None
+    final = data
     if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
         round_model = copy.deepcopy(model)
         round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC

@@ -37,8 +37,12 @@ def _to_torch(array: np.ndarray, like: Any) -> Any:
 
     is_float = array.dtype.kind == "f" and like.dtype.is_floating_point
     if like.device.type == "meta":
-        raise InputError("like is on the device meta, which holds no numbers: give one of another device")
-    return torch.from_dlpack(np.array(array)).to(device=like.device, dtype=like.dtype if is_float else None)
+        raise InputError(
+            "like is on the device meta, which holds no numbers: give one of another device"
+        )
+    return torch.from_dlpack(np.array(array)).to(
+        device=like.device, dtype=like.dtype if is_float else None
+    )
 
 
 def _to_jax(array: np.ndarray, like: Any) -> Any:
@@ -72,4 +76,10 @@ def _to_warp(array: np.ndarray, like: Any) -> Any:
     return warp.array(np.ascontiguousarray(array), dtype=dtype, device=like.device)
 
 
-_CONVERTERS = {"torch": _to_torch, "jax": _to_jax, "jaxlib": _to_jax, "cupy": _to_cupy, "warp": _to_warp}
+_CONVERTERS = {
+    "torch": _to_torch,
+    "jax": _to_jax,
+    "jaxlib": _to_jax,
+    "cupy": _to_cupy,
+    "warp": _to_warp,
+}

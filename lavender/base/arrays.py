@@ -55,7 +55,9 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name} cannot be read as an array ({error}); numbers are needed") from None
+            raise InputError(
+                f"{name} cannot be read as an array ({error}); numbers are needed"
+            ) from None
     if getattr(value, "requires_grad", False):
         raise InputError(f"{name} requires a gradient, which would be lost: give {name}.detach()")
     if hasattr(
@@ -77,7 +79,8 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
             continue
         if isinstance(array, np.ndarray) and array.dtype != object:
             return array
-    kind, device = type(value).__name__, getattr(value, "device", "unknown")
+    kind = type(value).__name__
+    device = getattr(value, "device", "unknown")
     raise InputError(
         f"{name} is a {kind} on device {device} that cannot be read ({reason}): copy it to the host"
     )
@@ -134,9 +137,12 @@ def as_array(
         raise InputError(f"{label} has dtype {array.dtype}; real numbers are needed")
     check_unmasked(label, value)
     if dtype is np.int32 and array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
-        raise InputError(f"{label} holds {array[array != np.rint(array)][0]:g}; whole numbers are needed")
+        raise InputError(
+            f"{label} holds {array[array != np.rint(array)][0]:g}; whole numbers are needed"
+        )
     if array.ndim == 0 and len(shape) == 1 and shape[0] is not None:
-        array, copy = np.full(shape[0], array), False
+        array = np.full(shape[0], array)
+        copy = False
     row_shape = shape[1:]
     if array.shape == (0,) and row_shape and not shape[0] and None not in row_shape:
         array = array.reshape(0, *row_shape)  # An empty list has shape (0,) if it lists rows, too.
@@ -144,11 +150,19 @@ def as_array(
         sizes = ", ".join("any" if n is None else str(n) for n in shape)
         required = f"({sizes}{',' * (len(shape) == 1)})"
         raise InputError(f"{label} has shape {array.shape}; {required} is needed")
-    if dtype is np.int32 and array.size and (float(array.min()) < -(2**31) or float(array.max()) >= 2**31):
-        raise InputError(f"{label} holds {array.min():g} to {array.max():g}; -2^31 to 2^31 - 1 is needed")
+    if (
+        dtype is np.int32
+        and array.size
+        and (float(array.min()) < -(2**31) or float(array.max()) >= 2**31)
+    ):
+        raise InputError(
+            f"{label} holds {array.min():g} to {array.max():g}; -2^31 to 2^31 - 1 is needed"
+        )
     if array.dtype.itemsize > 8:
         with np.errstate(over="ignore", under="ignore"):
-            array = array.astype(np.float64)  # Long doubles out of range become infinite without a warning.
+            array = array.astype(
+                np.float64
+            )  # Long doubles out of range become infinite without a warning.
     array = np.array(array, dtype, order="C") if copy else np.require(array, dtype, ["C", "A", "E"])
     if finite and array.dtype.kind == "f":
         check_finite_and_in_range(label, array, unit)
@@ -180,7 +194,9 @@ def check_unmasked(name: str, value: Any) -> None:
     if hasattr(value, "mask") and np.ma.is_masked(value):
         masked = np.argwhere(np.ma.getmaskarray(value))
         index = ", ".join(map(str, masked[0]))
-        raise InputError(f"{name} is masked at [{index}]; an array without masked entries is needed")
+        raise InputError(
+            f"{name} is masked at [{index}]; an array without masked entries is needed"
+        )
 
 
 def get_shape(name: str, value: Any) -> tuple[int, ...]:
@@ -188,7 +204,9 @@ def get_shape(name: str, value: Any) -> tuple[int, ...]:
     try:
         return np.shape(value)
     except ValueError as error:
-        raise InputError(f"{name} cannot be read as an array ({error}); numbers are needed") from None
+        raise InputError(
+            f"{name} cannot be read as an array ({error}); numbers are needed"
+        ) from None
 
 
 def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
@@ -211,7 +229,9 @@ def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
         return list(range(*i.indices(n)))
     name = f"an index of {thing}s"
     is_scalar = isinstance(i, np.ndarray) and i.ndim == 0 and i.dtype.kind in "iu"
-    if is_scalar or (isinstance(i, (int, np.integer)) and not isinstance(i, (bool, np.timedelta64))):
+    if is_scalar or (
+        isinstance(i, (int, np.integer)) and not isinstance(i, (bool, np.timedelta64))
+    ):
         if not -n <= i < n:
             raise IndexError(f"{thing} {i} does not exist; there are {n}, numbered from 0")
         return range(n)[i]
@@ -249,7 +269,9 @@ def check_float(
 
 def check_int(name: str, value: Any, low: int = 0, high: int | None = 2**31 - 1) -> int:
     """Return `value` as an int; raise InputError unless it is an integer in [low, high] (high None: no limit)."""
-    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(
+        value, (bool, np.timedelta64)
+    )
     if not is_integer or value < low or (high is not None and value > high):
         upto = "" if high is None else f" to {high}"
         raise InputError(f"{name} is {value!r}; a whole number from {low}{upto} is needed")
@@ -263,7 +285,9 @@ def check_bool(name: str, value: object) -> bool:
     return bool(value)
 
 
-def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many: str = "") -> sp.csr_array:
+def as_csr(
+    name: str, value: Any, *, copy: bool = True, unit: str = "", too_many: str = ""
+) -> sp.csr_array:
     """Convert a sparse matrix to read-only compressed rows of float64 and int32 with sorted columns.
 
     Indices and numbers are checked.
@@ -281,14 +305,18 @@ def as_csr(name: str, value: Any, *, copy: bool = True, unit: str = "", too_many
         Advice at the end of the message about more than 2^31 - 1 nonzeros.
     """
     if value.nnz >= 2**31:
-        raise InputError(f"{name} has {value.nnz} nonzeros; at most 2^31 - 1 can be indexed{too_many}")
+        raise InputError(
+            f"{name} has {value.nnz} nonzeros; at most 2^31 - 1 can be indexed{too_many}"
+        )
     if value.dtype.kind not in "buif":
         raise InputError(f"{name} has dtype {value.dtype}; real numbers are needed")
     try:
         a = sp.csr_array(value, copy=copy)
         a.check_format(full_check=True)  # Check all indices here, since the kernels do not.
     except ValueError as error:
-        raise InputError(f"{name} is not a valid compressed matrix ({error}); check its indices") from None
+        raise InputError(
+            f"{name} is not a valid compressed matrix ({error}); check its indices"
+        ) from None
     if not a.has_canonical_format:
         a = a if copy else a.copy()
         a.sum_duplicates()
@@ -306,7 +334,9 @@ def get_common_precision(*values: Any) -> str:
             return "float64"
     types = {getattr(x, "dtype", None) for x in values if x is not None}
     # float32 in the other byte order is a different dtype of the same precision.
-    is_single = bool(types) and all(isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types)
+    is_single = bool(types) and all(
+        isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types
+    )
     return "float32" if is_single else "float64"
 
 
@@ -320,7 +350,8 @@ def _raise_at_first(
 ) -> NoReturn:
     """Raise InputError at the first entry of the mask `is_bad`; if `csr` is given, `array` is its data."""
     bad = np.argwhere(is_bad)
-    index, value = bad[0], array[tuple(bad[0])]
+    index = bad[0]
+    value = array[tuple(bad[0])]
     if csr is not None:
         row = np.searchsorted(csr.indptr, index[0], side="right") - 1
         index = np.array([row, csr.indices[index[0]]])
@@ -336,11 +367,14 @@ def check_finite(name: str, array: np.ndarray, csr: Any = None) -> None:
         _raise_at_first(name, "be finite", array, ~np.isfinite(array), csr)
 
 
-def check_finite_and_in_range(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
+def check_finite_and_in_range(
+    name: str, array: np.ndarray, unit: str = "", csr: Any = None
+) -> None:
     """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
     if not checks.all_in_valid_range(array.reshape(-1)):
         check_finite(name, array, csr)
-        requirement, is_bad = f"be at most {MAX_MAGNITUDE:g} in size", np.abs(array) > MAX_MAGNITUDE
+        requirement = f"be at most {MAX_MAGNITUDE:g} in size"
+        is_bad = np.abs(array) > MAX_MAGNITUDE
         _raise_at_first(name, requirement, array, is_bad, csr, _suggest_unit(unit))
 
 
@@ -349,7 +383,8 @@ def check_nonnegative_magnitudes(name: str, array: np.ndarray, unit: str = "") -
     if checks.find_invalid_magnitude_in_array(array.reshape(-1)) >= 0:
         check_finite_and_in_range(name, array, unit)
         check_not_negative(name, array)
-        requirement, is_bad = f"be 0 or at least {MIN_MAGNITUDE:g}", (array > 0.0) & (array < MIN_MAGNITUDE)
+        requirement = f"be 0 or at least {MIN_MAGNITUDE:g}"
+        is_bad = (array > 0.0) & (array < MIN_MAGNITUDE)
         _raise_at_first(name, requirement, array, is_bad, advice=_suggest_unit(unit))
 
 
@@ -370,8 +405,14 @@ def _suggest_unit(unit: str) -> str:
     if unit == "-":
         return ": this quantity has no unit that you could change"
     letters = set(unit.replace("rad", "").replace("N s", "kg m/s"))
-    units = [name for letter, name in (("k", "mass"), ("m", "length"), ("s", "time")) if letter in letters]
-    return f": another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"
+    units = [
+        name
+        for letter, name in (("k", "mass"), ("m", "length"), ("s", "time"))
+        if letter in letters
+    ]
+    return (
+        f": another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"
+    )
 
 
 def check_sequence(name: str, value: Any, things: str) -> list[Any]:
@@ -393,7 +434,9 @@ def as_names(things: str, value: Any, count: int) -> tuple[str, ...]:
     """Return names of `count` things as a tuple; raise InputError for another number of names."""
     names = tuple(map(str, check_sequence(f"names of {things}", value, f"{count} words")))
     if len(names) != count:
-        raise InputError(f"names has {len(names)} entries for {count} {things}; one name for each is needed")
+        raise InputError(
+            f"names has {len(names)} entries for {count} {things}; one name for each is needed"
+        )
     return names
 
 
@@ -408,5 +451,7 @@ def format_html_table(facts: Mapping[str, Any], title: str) -> str:
     """Format facts as a small HTML table for notebooks; every text is escaped."""
     from html import escape
 
-    rows = "".join(f"<tr><th>{escape(str(k))}</th><td>{escape(str(v))}</td></tr>" for k, v in facts.items())
+    rows = "".join(
+        f"<tr><th>{escape(str(k))}</th><td>{escape(str(v))}</td></tr>" for k, v in facts.items()
+    )
     return f"<table><caption>{escape(title)}</caption>{rows}</table>"

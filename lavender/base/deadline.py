@@ -40,7 +40,8 @@ UNLIMITED: AbstractContextManager[None] = nullcontext()
 @contextmanager
 def limit_forming(deadline: Deadline | None) -> Iterator[None]:
     """Let this thread's forming of A raise TooLate after the deadline; None or no limit: it ends."""
-    before, FORMING.deadline = FORMING.deadline, deadline
+    before = FORMING.deadline
+    FORMING.deadline = deadline
     try:
         yield
     finally:

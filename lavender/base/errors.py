@@ -9,9 +9,19 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "BREAKDOWN", "CapabilityError", "InUse", "InputError", "LavenderError", "SolveFailed", "SolverUnavailable",
-    "TooLarge", "UnknownName", "check_name", "format_error", "require_packages",
-]  # fmt: skip
+    "BREAKDOWN",
+    "CapabilityError",
+    "InUse",
+    "InputError",
+    "LavenderError",
+    "SolveFailed",
+    "SolverUnavailable",
+    "TooLarge",
+    "UnknownName",
+    "check_name",
+    "format_error",
+    "require_packages",
+]
 
 
 class LavenderError(Exception):

@@ -44,7 +44,9 @@ class _LazyModule:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_name" or name.startswith("__"):  # `copy` reads these names of an uninitialised object.
+        if name == "_name" or name.startswith(
+            "__"
+        ):  # `copy` reads these names of an uninitialised object.
             raise AttributeError(name)
         value = getattr(import_module_under_lock(self._name), name)
         setattr(self, name, value)

@@ -18,7 +18,9 @@ def factor_sparse_lu(matrix: Any, **options: Any) -> Any:
 
     `options` are the options of `scipy.sparse.linalg.splu`.
     """
-    from scipy.sparse.linalg import splu  # Imported here: it takes 0.1 s, and only this function needs it.
+    from scipy.sparse.linalg import (
+        splu,
+    )  # Imported here: it takes 0.1 s, and only this function needs it.
 
     a = sp.csc_array(matrix)
     # A full diagonal implies full structural rank.

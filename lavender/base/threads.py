@@ -72,7 +72,9 @@ def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
             futures += [get_thread_pool().submit(run) for _ in range(threads - 1)]
         return [run(), *(future.result() for future in futures if not future.cancel())]
     finally:
-        stop[0] = 1  # Stop the other threads also if Ctrl-C interrupted this thread while it waited for them.
+        stop[0] = (
+            1  # Stop the other threads also if Ctrl-C interrupted this thread while it waited for them.
+        )
         for future in futures:
             if not future.cancel():
                 future.exception()

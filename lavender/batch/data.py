@@ -115,10 +115,12 @@ class Batch(Sequence[Problem]):
         if row_ptr is not None and count is None:
             rows = _check_world_pointers("row_ptr", row_ptr)
             if jac.ndim == 2 and velocity_ptr is None:
-                n, nv = len(rows) - 1, jac.shape[1]
+                n = len(rows) - 1
+                nv = jac.shape[1]
                 velocities = nv * np.arange(n + 1)
             elif velocity_ptr is not None:
-                n, velocities = len(rows) - 1, _check_world_pointers("velocity_ptr", velocity_ptr)
+                n = len(rows) - 1
+                velocities = _check_world_pointers("velocity_ptr", velocity_ptr)
             else:
                 raise InputError(
                     f"J has shape {jac.shape}; a ragged batch needs (rows of all worlds, nv), or "
@@ -134,16 +136,25 @@ class Batch(Sequence[Problem]):
             capacity = None
         elif row_ptr is None and velocity_ptr is None and jac.ndim == 3:
             n, capacity, nv = jac.shape
-            sizes = np.full(n, capacity) if count is None else check_row_counts("count", count, n, capacity)
+            sizes = (
+                np.full(n, capacity)
+                if count is None
+                else check_row_counts("count", count, n, capacity)
+            )
             nvs = np.full(n, nv)
             rows, velocities = capacity * np.arange(n + 1), nv * np.arange(n + 1)
             self.shape, self.velocity_shape = (n, capacity), (n, nv)
         else:
-            raise InputError(f"J has shape {jac.shape}; (n, m, nv) is needed, or with row_ptr (rows, nv)")
+            raise InputError(
+                f"J has shape {jac.shape}; (n, m, nv) is needed, or with row_ptr (rows, nv)"
+            )
         self._n, self.friction = n, friction
         self.precision = get_common_precision(*(np.asarray(x) for x in (jac, mass, free)))
         self.at = at = np.zeros(n, WORLD)
-        at["rows"], at["velocities"], at["row"], at["velocity"] = sizes, nvs, rows[:-1], velocities[:-1]
+        at["rows"] = sizes
+        at["velocities"] = nvs
+        at["row"] = rows[:-1]
+        at["velocity"] = velocities[:-1]
         self._set_cones(cones)
         self._pattern = check_shared_lower_triangles(pattern, nvs, mass) if pattern else None
         shapes: Sequence[Any] = 4 * (None,)
@@ -167,28 +178,51 @@ class Batch(Sequence[Problem]):
 
     @classmethod
     def _from_valid_rows(
-        cls, jac: FloatArray, mass: FloatArray, pattern: Any, free: FloatArray, target: FloatArray,
-        compliance: FloatArray, cones: Cones, places: np.ndarray,
-    ) -> Batch:  # fmt: skip
+        cls,
+        jac: FloatArray,
+        mass: FloatArray,
+        pattern: Any,
+        free: FloatArray,
+        target: FloatArray,
+        compliance: FloatArray,
+        cones: Cones,
+        places: np.ndarray,
+    ) -> Batch:
         """Build a ragged batch under the cone law from contiguous float64 arrays, without the checks of `__init__`.
 
         `mass` (n, entries) are lower triangles with the pattern (indptr, indices). `places` (2, n + 1) are the first
         row and the first block of each world, and their ends.
         """
-        batch, (n, nv), (rows, blocks) = cls.__new__(cls), free.shape, places
-        batch._n, batch.friction, batch.precision, batch.engine_motions = n, "cone", "float64", {}
-        batch.shape, batch.velocity_shape, batch.cones = target.shape, (n * nv,), cones
-        batch._has_shared_cones, batch._pattern, batch._jac_row, batch._mass_row = (
-            False,
-            pattern,
-            nv,
-            mass.shape[1],
+        batch = cls.__new__(cls)
+        (n, nv) = free.shape
+        (rows, blocks) = places
+        batch._n = n
+        batch.friction = "cone"
+        batch.precision = "float64"
+        batch.engine_motions = {}
+        batch.shape = target.shape
+        batch.velocity_shape = (n * nv,)
+        batch.cones = cones
+        batch._has_shared_cones = False
+        batch._pattern = pattern
+        batch._jac_row = nv
+        batch._mass_row = mass.shape[1]
+        batch._arrays = (
+            jac.reshape(-1),
+            mass.reshape(-1),
+            free.reshape(-1),
+            target,
+            compliance,
+            None,
         )
-        batch._arrays = jac.reshape(-1), mass.reshape(-1), free.reshape(-1), target, compliance, None
         batch.at = at = np.zeros(n, WORLD)
-        at["rows"], at["velocities"], at["blocks"] = rows[1:] - rows[:-1], nv, blocks[1:] - blocks[:-1]
+        at["rows"] = rows[1:] - rows[:-1]
+        at["velocities"] = nv
+        at["blocks"] = blocks[1:] - blocks[:-1]
         at["row"] = at["target"] = at["soft"] = at["cone_row"] = rows[:-1]
-        at["jac"], at["mass"], at["block"] = nv * rows[:-1], mass.shape[1] * np.arange(n), blocks[:-1]
+        at["jac"] = nv * rows[:-1]
+        at["mass"] = mass.shape[1] * np.arange(n)
+        at["block"] = blocks[:-1]
         at["free"] = at["velocity"] = nv * np.arange(n)
         return batch
 
@@ -196,18 +230,23 @@ class Batch(Sequence[Problem]):
     names_of: Callable[[int], Sequence[str]] | None = None
     # Function that returns which rows of a world are angular, as the argument `angular` of `Problem`.
     angular_of: Callable[[int], Any] | None = None
-    contact_counts: np.ndarray | None = None  # (n,) Number of contacts with rows; None if it is not known.
+    contact_counts: np.ndarray | None = (
+        None  # (n,) Number of contacts with rows; None if it is not known.
+    )
     _has_shared_cones = True
 
     # -- blocks ----------------------------------------------------------------------------------------
 
     def _set_cones(self, cones: Any) -> None:
         """Store the cones of all worlds or of each world, and the offsets of each world's blocks and rows in them."""
-        at, sizes = self.at, self.at["rows"]
+        at = self.at
+        sizes = self.at["rows"]
         if not isinstance(cones, Cones):
             parts = check_sequence("cones", cones, f"Cones, one for each of {len(self)} worlds,")
             if len(parts) != len(self) or not all(isinstance(c, Cones) for c in parts):
-                raise InputError(f"cones has {len(parts)} entries; a Cones, or one for each world, is needed")
+                raise InputError(
+                    f"cones has {len(parts)} entries; a Cones, or one for each world, is needed"
+                )
             cones = Cones._concatenate(parts)
         self.cones = cones
         if cones.has_round and self.friction != "cone":
@@ -237,7 +276,9 @@ class Batch(Sequence[Problem]):
                 f"the blocks of the cones do not begin and end with the {sizes[bad[0]]} rows of world "
                 f"{bad[0]}; every block must belong to one world: give a list with one Cones for each world"
             )
-        at["block"], at["blocks"], at["cone_row"] = block, last - block, first
+        at["block"] = block
+        at["blocks"] = last - block
+        at["cone_row"] = first
 
     def _get_cones_of_world(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Return the blocks of world i, with mu (k,) if it is given."""
@@ -283,26 +324,39 @@ class Batch(Sequence[Problem]):
     def get_world(self, i: int, named: bool = True) -> Problem:
         """Return world i as a `Problem` made of copies, with or without names of blocks and units of rows."""
         world = dict(zip(WORLD.names, self.at[i].item(), strict=True))  # type: ignore[arg-type]
-        jac, mass, free, target, compliance, mu = (self._get_array_of_world(world, k) for k in range(6))
+        jac, mass, free, target, compliance, mu = (
+            self._get_array_of_world(world, k) for k in range(6)
+        )
         cones = self._get_cones_of_world(i, None if mu is None else as_array("mu", mu, (None,)))
         problem = Problem.from_jacobian(
-            jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
-            precision=self.precision, names=None if self.names_of is None or not named else self.names_of(i),
+            jac,
+            mass,
+            free,
+            target=target,
+            cones=cones,
+            compliance=compliance,
+            friction=self.friction,
+            precision=self.precision,
+            names=None if self.names_of is None or not named else self.names_of(i),
             angular=None if self.angular_of is None or not named else self.angular_of(i),
-        )  # fmt: skip
+        )
         if i in self.engine_motions:
             problem.__dict__["engine_motion"] = self.engine_motions[i]
         return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:
         """Return an array of a world (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
-        array, m, nv, k = self._arrays[which], world["rows"], world["velocities"], world["blocks"]
+        array = self._arrays[which]
+        m = world["rows"]
+        nv = world["velocities"]
+        k = world["blocks"]
         first = world[("jac", "mass", "free", "target", "soft", "mu")[which]]
         if array is None:
             return None
         if which == 1 and self._pattern is not None:
             ptr, col = self._pattern
-            row, dense = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
+            row = np.repeat(np.arange(nv), np.diff(ptr))
+            dense = np.zeros((nv, nv), array.dtype)
             dense[row, col] = dense[col, row] = array[first : first + len(col)]
             return dense
         if which < 2:
@@ -310,7 +364,9 @@ class Batch(Sequence[Problem]):
             if not rows * nv:
                 return np.zeros((rows, nv), array.dtype)
             strides = (stride or nv) * array.itemsize, array.itemsize
-            return np.lib.stride_tricks.as_strided(array[first:], (rows, nv), strides, writeable=False)
+            return np.lib.stride_tricks.as_strided(
+                array[first:], (rows, nv), strides, writeable=False
+            )
         return array[first : first + (nv, m, m, k)[which - 2]]
 
     def rows_of(self, i: int) -> slice:
@@ -323,19 +379,26 @@ class Batch(Sequence[Problem]):
 
         Numbers need not be finite.
         """
-        array = as_array(name, getattr(value, "impulse", value), self.shape, finite=False, unit="N s")
+        array = as_array(
+            name, getattr(value, "impulse", value), self.shape, finite=False, unit="N s"
+        )
         return array.reshape(-1).copy()
 
     def make_kernel_worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
-        worlds = Worlds(self.at.view(np.int64).reshape(len(self), len(PLACE)), impulse, velocity, cold)
+        worlds = Worlds(
+            self.at.view(np.int64).reshape(len(self), len(PLACE)), impulse, velocity, cold
+        )
         if self.cones.has_ellipse:
             worlds.set_from_problems([], [None] * len(self), [])
         else:
             is_single = self._arrays[1].dtype == np.float32
-            strides, law = (self._jac_row, self._mass_row), LAWS[self.friction]
+            strides = (self._jac_row, self._mass_row)
+            law = LAWS[self.friction]
             asymmetry = MAX_ASYMMETRY_FLOAT32 if is_single else MAX_ASYMMETRY
-            worlds.set_from_arrays(self._arrays, strides, self._pattern, self.cones._blocks, law, asymmetry)
+            worlds.set_from_arrays(
+                self._arrays, strides, self._pattern, self.cones._blocks, law, asymmetry
+            )
         return worlds
 
     def __repr__(self) -> str:
@@ -366,7 +429,9 @@ def check_shared_lower_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
     if len(arrays) != 2:
-        raise InputError(f"M is a tuple of {1 + len(arrays)} arrays; (values, indices, indptr) are needed")
+        raise InputError(
+            f"M is a tuple of {1 + len(arrays)} arrays; (values, indices, indptr) are needed"
+        )
     col, ptr = (
         as_array(name, x, (None,), dtype=np.int32)
         for name, x in zip(("indices of M", "indptr of M"), arrays, strict=True)
@@ -417,21 +482,36 @@ def _flatten(
     if shape is None:
         total = int(sizes.sum())
         if x.size != total:
-            raise InputError(f"{name} has shape {x.shape}; {total} numbers are needed, world after world")
+            raise InputError(
+                f"{name} has shape {x.shape}; {total} numbers are needed, world after world"
+            )
         return np.ascontiguousarray(x).reshape(-1), _compute_offsets(sizes), 0
     if x.shape == shape:
         x = np.broadcast_to(x, (n, *shape))
     if x.shape != (n, *shape):
         raise InputError(f"{name} has shape {x.shape}; {(n, *shape)} or {shape} is needed")
-    size, is_matrix = x.itemsize, len(shape) == 2 and shape[0] > 1
+    size = x.itemsize
+    is_matrix = len(shape) == 2 and shape[0] > 1
     # Arrays are read in place if each world is stored row by row in aligned memory.
-    has_item_strides = all(stride >= 0 and stride % size == 0 for stride in x.strides) and x.flags.aligned
+    has_item_strides = (
+        all(stride >= 0 and stride % size == 0 for stride in x.strides) and x.flags.aligned
+    )
     has_contiguous_rows = x.shape[-1] < 2 or x.strides[-1] == size
-    if not (has_item_strides and has_contiguous_rows) or (is_matrix and x.strides[1] < shape[1] * size):
+    if not (has_item_strides and has_contiguous_rows) or (
+        is_matrix and x.strides[1] < shape[1] * size
+    ):
         x = np.ascontiguousarray(x)
     if x.flags.c_contiguous:
         flat = x.reshape(-1)
     else:  # A flat view of the memory that the array spans.
-        length = 1 + sum((k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True))
-        flat = np.lib.stride_tricks.as_strided(x, (length if x.size else 0,), (size,), writeable=False)
-    return flat, np.arange(n) * (x.strides[0] // size), x.strides[1] // size if is_matrix else shape[-1]
+        length = 1 + sum(
+            (k - 1) * stride // size for k, stride in zip(x.shape, x.strides, strict=True)
+        )
+        flat = np.lib.stride_tricks.as_strided(
+            x, (length if x.size else 0,), (size,), writeable=False
+        )
+    return (
+        flat,
+        np.arange(n) * (x.strides[0] // size),
+        x.strides[1] // size if is_matrix else shape[-1],
+    )

@@ -43,10 +43,14 @@ from lavender_ext.core.checks import make_instance
 
 # Row of `Worlds.numbers` of each field of a residual.
 NUMBER_OF_FIELD = {
-    "relative": NUMBER["relative"], "energy": NUMBER["energy"], "velocity": NUMBER["speed"],
-    "roundoff_floor": NUMBER["roundoff_floor"], "above_floor": NUMBER["above_floor"],
-    "energy_at_zero": NUMBER["reference_energy"], "velocity_at_zero": NUMBER["reference_speed"],
-}  # fmt: skip
+    "relative": NUMBER["relative"],
+    "energy": NUMBER["energy"],
+    "velocity": NUMBER["speed"],
+    "roundoff_floor": NUMBER["roundoff_floor"],
+    "above_floor": NUMBER["above_floor"],
+    "energy_at_zero": NUMBER["reference_energy"],
+    "velocity_at_zero": NUMBER["reference_speed"],
+}
 NO_VELOCITY = np.zeros(0)
 NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
@@ -92,7 +96,8 @@ class WorldResults:
             return
         self._data, at, m = list_problem_data(problems, Problem)
         self._sizes, self._first = at[:, PLACE["rows"]], at[:, PLACE["row"]]
-        self._impulse, self._velocity = np.zeros(m), None
+        self._impulse = np.zeros(m)
+        self._velocity = None
         self._worlds = Worlds(at, self._impulse, NO_VELOCITY, cold)
         self._worlds.set_from_problems(problems, self._data, starts)
 
@@ -100,10 +105,13 @@ class WorldResults:
     energy = _Column("energy", "Energy norm of the error (n,) [sqrt J].")
     velocity_error = _Column("speed", "Velocity error of the worst row (n,) [m/s].")
     velocity_at_zero = _Column(
-        "reference_speed", "Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."
+        "reference_speed",
+        "Velocity error of the zero impulse (n,) [m/s], the reference of `relative`.",
     )
     impulse_error = _Column("push", "Impulse error of the worst row (n,) [N s].")
-    roundoff_floor = _Column("roundoff_floor", "Relative residual that rounding alone can cause (n,) [-].")
+    roundoff_floor = _Column(
+        "roundoff_floor", "Relative residual that rounding alone can cause (n,) [-]."
+    )
 
     @property
     def worst_row(self) -> np.ndarray:
@@ -126,20 +134,26 @@ class WorldResults:
         for name, row in NUMBER_OF_FIELD.items():
             numbers[row, i] = getattr(residual, name)
         push = abs(residual.error[residual.worst_row]) if residual.worst_row >= 0 else 0.0
-        numbers[NUMBER["push"], i], self._worlds.worst[i] = push, residual.worst_row
+        numbers[NUMBER["push"], i] = push
+        self._worlds.worst[i] = residual.worst_row
 
     def _make_residual(self, i: int, judge: Callable[[int], Residual], **fields: Any) -> Residual:
         """Return the residual of world i by the stored numbers; `judge` computes its other fields when one is read."""
         numbers = self._worlds.numbers[:, i].tolist()
         fields |= {name: numbers[row] for name, row in NUMBER_OF_FIELD.items()}
-        fields |= {"worst_row": int(self._worlds.worst[i]), "_rest": (lambda: judge(i).__getstate__(), ())}
+        fields |= {
+            "worst_row": int(self._worlds.worst[i]),
+            "_rest": (lambda: judge(i).__getstate__(), ()),
+        }
         found: Residual = make_instance(Residual, fields)
         return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the results, in NumPy arrays, without the data of the compiled loop."""
         loop = self._worlds
-        results = SimpleNamespace(numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code)
+        results = SimpleNamespace(
+            numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code
+        )
         return vars(self) | {"_worlds": results, "_data": None, "_convert": None}
 
     def __len__(self) -> int:
@@ -188,7 +202,9 @@ class WorldResults:
         run_on_threads(work, min(threads, len(self)))
         code = self._worlds.code
         # Bytes are searched in a tenth of the time of an array of booleans.
-        for i in (code == CODE["bad"]).nonzero()[0].tolist() if CODE["bad"] in code.tobytes() else ():
+        for i in (
+            (code == CODE["bad"]).nonzero()[0].tolist() if CODE["bad"] in code.tobytes() else ()
+        ):
             # Repeat the invalid world by a single call, which raises the complete error.
             try_single(i, bytearray(1))
         if self.faults and errors == "raise":
@@ -213,7 +229,12 @@ class Residuals(WorldResults):
     """
 
     def __init__(
-        self, problems: Any, starts: Any, precision: Sequence[str], threshold: float, like: Any = None
+        self,
+        problems: Any,
+        starts: Any,
+        precision: Sequence[str],
+        threshold: float,
+        like: Any = None,
     ) -> None:
         super().__init__(problems, starts, False, like)
         self.precision, self.threshold = precision, threshold
@@ -260,7 +281,9 @@ class Residuals(WorldResults):
         self._worlds.numbers[NUMBER["rhs_energy"], i] = residual.energy_rhs
 
     def _judge_world(self, i: int) -> Residual:
-        return residual(self.problems[i], self._impulse[self._get_rows(i)], self.precision[i], self.threshold)
+        return residual(
+            self.problems[i], self._impulse[self._get_rows(i)], self.precision[i], self.threshold
+        )
 
     def _get_result(self, i: int) -> Residual:
         if i in self._nothing_to_do or not self._sizes[i]:
@@ -271,7 +294,9 @@ class Residuals(WorldResults):
 
     def __repr__(self) -> str:
         verdicts, counts = np.unique(self.verdict, return_counts=True)
-        summary = ", ".join(f"{n} {verdict or 'bad'}" for verdict, n in zip(verdicts, counts, strict=True))
+        summary = ", ".join(
+            f"{n} {verdict or 'bad'}" for verdict, n in zip(verdicts, counts, strict=True)
+        )
         return f"<Residuals of {len(self)} worlds: {summary}>"
 
 
@@ -355,10 +380,14 @@ def residual_many(
         errors,
     )
     above_floor = residuals._get_column("above_floor")
-    for i, precision in enumerate(precisions):  # For a list of problems, the compiled loop assumes float64.
+    for i, precision in enumerate(
+        precisions
+    ):  # For a list of problems, the compiled loop assumes float64.
         is_float32 = precision == "float32" and not is_single_precision
         is_engine = (
-            i in worlds.engine_motions if type(worlds) is Batch else "engine_motion" in worlds[i].__dict__
+            i in worlds.engine_motions
+            if type(worlds) is Batch
+            else "engine_motion" in worlds[i].__dict__
         )
         if (is_float32 or (is_engine and above_floor[i] != 0.0)) and i not in residuals.faults:
             judge_single(i)
@@ -376,7 +405,9 @@ def check_problems(problems: Any, errors: str) -> Any:
     if type(problems) is Batch:
         return problems
     is_list = type(problems) is list
-    problems = list(problems) if is_list else check_sequence("problems", problems, "Problems, or a Batch,")
+    problems = (
+        list(problems) if is_list else check_sequence("problems", problems, "Problems, or a Batch,")
+    )
     for problem in problems:
         if type(problem) is not Problem:
             check_problem(problem)

@@ -16,7 +16,12 @@ from lavender.base.arrays import FloatArray, check_int, mark_read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
-from lavender.batch.residuals import WorldResults, check_problems, convert_impulses_or_guesses, residual_many
+from lavender.batch.residuals import (
+    WorldResults,
+    check_problems,
+    convert_impulses_or_guesses,
+    residual_many,
+)
 from lavender.judge.residuals import Residual, judge_impulse, make_residual, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, name_start, raise_if_interrupted
 from lavender.problem import Problem
@@ -27,7 +32,11 @@ from lavender.solving.limits import check_time_limit
 from lavender.solving.loop import MIN_TIME_LIMIT
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.solve import solve
-from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity, check_velocity_tolerance
+from lavender.solving.velocity import (
+    MAX_VELOCITY_TOLERANCE,
+    accept_velocity,
+    check_velocity_tolerance,
+)
 from lavender_ext.batch.many import CODE, NUMBER, Worker
 from lavender_ext.judge.measure import all_finite
 
@@ -75,7 +84,9 @@ class Solutions(WorldResults, Sequence[Solution]):
 
     velocity_tol: float | None = None
 
-    def __init__(self, problems: Any, starts: Any, tol: float, spec: SolverSpec, like: Any = None) -> None:
+    def __init__(
+        self, problems: Any, starts: Any, tol: float, spec: SolverSpec, like: Any = None
+    ) -> None:
         # Keep a copy of the starts of a batch, because the loop overwrites them.
         self._starts = starts.copy() if isinstance(starts, np.ndarray) else starts
         super().__init__(problems, starts, starts is None, like)
@@ -107,7 +118,9 @@ class Solutions(WorldResults, Sequence[Solution]):
         velocities = [np.zeros(0)]
         for i, p in enumerate(self.problems):
             if p.matrix is None:
-                v = p.velocity(p._start if i in self.faults else self._impulse[self._get_rows(i)]).ravel()
+                v = p.velocity(
+                    p._start if i in self.faults else self._impulse[self._get_rows(i)]
+                ).ravel()
                 velocities.append(np.full_like(v, np.nan) if i in self.faults else v)
         return mark_read_only(np.concatenate(velocities))
 
@@ -116,7 +129,9 @@ class Solutions(WorldResults, Sequence[Solution]):
         """Status of each world (n,), see the class."""
         code = self._worlds.code[:-1]
         out = np.where(
-            code == CODE["late"], INDEX_OF_STATUS[Status.TIME_LIMIT], INDEX_OF_STATUS[Status.CONVERGED]
+            code == CODE["late"],
+            INDEX_OF_STATUS[Status.TIME_LIMIT],
+            INDEX_OF_STATUS[Status.CONVERGED],
         )
         for i, solution in self._solutions.items():
             out[i] = INDEX_OF_STATUS[solution.status]
@@ -198,7 +213,8 @@ class Solutions(WorldResults, Sequence[Solution]):
         """Build the solution of a world that the compiled loop processed."""
         if not self._sizes[i]:
             return solve(self.problems[i], self._spec.name, tol=self.tol)
-        impulse, late = self._impulse[self._get_rows(i)].copy(), self._worlds.code[i] == CODE["late"]
+        impulse = self._impulse[self._get_rows(i)].copy()
+        late = self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
         guess = None if type(self.problems) is Batch else self.problems[i].guess
@@ -207,12 +223,18 @@ class Solutions(WorldResults, Sequence[Solution]):
             problem = self.problems[i]
             return make_residual(problem, judge_impulse(problem, impulse).refine(self.tol))
 
-        return Solution.from_fields({
-            "impulse": impulse, "status": status, "tol": self.tol, "setup_time": 0.0,
-            "solve_time": self._time_per_world, "residual": self._make_residual(i, judge_world),
-            "start": name_start(guess, self.get_start(i)),
-            "_rest": (self._make_postponed_fields, (i, impulse, status)),
-        })  # fmt: skip
+        return Solution.from_fields(
+            {
+                "impulse": impulse,
+                "status": status,
+                "tol": self.tol,
+                "setup_time": 0.0,
+                "solve_time": self._time_per_world,
+                "residual": self._make_residual(i, judge_world),
+                "start": name_start(guess, self.get_start(i)),
+                "_rest": (self._make_postponed_fields, (i, impulse, status)),
+            }
+        )
 
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are computed only at its first access."""
@@ -220,7 +242,9 @@ class Solutions(WorldResults, Sequence[Solution]):
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if is_start else tuple(self._worlds.counts[i].tolist())
-        fields = compute_postponed_fields(problem, self._spec, judgement, counts, self.get_start(i), status)
+        fields = compute_postponed_fields(
+            problem, self._spec, judgement, counts, self.get_start(i), status
+        )
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
         # If the data have not changed since the solve, both residuals are bit-identical.
         if status is Status.CONVERGED and judgement.relative != solved_relative:
@@ -308,7 +332,11 @@ def solve_many(
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
-        spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+        spec.builtin
+        and not options
+        and max_iter is None
+        and isinstance(tol, float)
+        and 0.0 < tol < np.inf
     )
     small = spec.small if uses_loop else None
     call = None if small is None else small.call
@@ -317,16 +345,24 @@ def solve_many(
         return int(hand.process_worlds(tol, call, deadline))
 
     def solve_single(i: int) -> None:
-        problem, start = worlds[i], solutions.get_start(i)
+        problem = worlds[i]
+        start = solutions.get_start(i)
         if solutions._worlds.code[i] == CODE["tried"]:
-            own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT)) if deadline.is_set else None
+            own = (
+                Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT))
+                if deadline.is_set
+                else None
+            )
             counts = tuple(solutions._worlds.counts[i].tolist())
-            prepared, checked = Prepared(problem, spec, named, False), check_arguments(spec, tol, max_iter)
+            prepared = Prepared(problem, spec, named, False)
+            checked = check_arguments(spec, tol, max_iter)
             solution = prepared._solve(problem, start, *checked, own, failed_call=counts)
         else:
             left = deadline.get_remaining_seconds(MIN_TIME_LIMIT)
             solution = solve(problem, solver, impulse=start, time_limit=left, **more)
-        solutions.store_solution(i, solution if "callback" in options else raise_if_interrupted(solution))
+        solutions.store_solution(
+            i, solution if "callback" in options else raise_if_interrupted(solution)
+        )
 
     begin = perf_counter()
     solutions._process_worlds(process_until_deferred, solve_single, threads, errors)
@@ -343,9 +379,15 @@ def _compute_tolerance_for_velocity_error(worlds: Any, velocity_tol: float) -> f
         # The velocity error of the zero impulse does not depend on the impulse that is judged.
         references = residual_many(worlds, np.zeros(worlds.shape), errors="status").velocity_at_zero
     else:
-        references = np.array([residual(p, p.start()).velocity_at_zero for p in worlds if p.m], float)
+        references = np.array(
+            [residual(p, p.start()).velocity_at_zero for p in worlds if p.m], float
+        )
     largest = float(np.max(references[np.isfinite(references)], initial=0.0))
-    return min(velocity_tol / largest, MAX_VELOCITY_TOLERANCE) if largest > 0.0 else MAX_VELOCITY_TOLERANCE
+    return (
+        min(velocity_tol / largest, MAX_VELOCITY_TOLERANCE)
+        if largest > 0.0
+        else MAX_VELOCITY_TOLERANCE
+    )
 
 
 def _convert_starts(
@@ -364,22 +406,30 @@ def _convert_starts(
     parts: Iterable[tuple[int, Any]] = ()
     if type(worlds) is Batch:
         if impulses is not None:
-            raise InputError("impulses= needs a list of problems; a batch takes impulse=, one for all worlds")
+            raise InputError(
+                "impulses= needs a list of problems; a batch takes impulse=, one for all worlds"
+            )
         starts = None if impulse is None else worlds.flatten_impulses("impulse", impulse)
         if starts is not None and not all_finite(starts):
             parts = ((i, starts[worlds.rows_of(i)]) for i in range(len(worlds)))
     else:
         if impulse is not None:
-            raise InputError("impulse= needs a batch; a list of problems takes impulses=, one for each")
+            raise InputError(
+                "impulse= needs a batch; a list of problems takes impulses=, one for each"
+            )
         starts = (
-            [p.guess for p in worlds] if impulses is None else convert_impulses_or_guesses(worlds, impulses)
+            [p.guess for p in worlds]
+            if impulses is None
+            else convert_impulses_or_guesses(worlds, impulses)
         )
         parts = [(i, start) for i, start in enumerate(starts) if start is not None]
     invalid = dict[int, LavenderError]()
     for i, start in parts:
         if not all_finite(start):
             bad = np.flatnonzero(~np.isfinite(start))[0]
-            message = f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
+            message = (
+                f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
+            )
             invalid[i] = InputError(message)
             if errors == "raise":
                 raise invalid[i]

@@ -6,7 +6,13 @@ A command imports its modules when it runs, so that --help is fast.
 import sys
 
 from lavender.base.errors import InputError, require_packages
-from lavender.base.exits import EXIT_BAD_INPUT, EXIT_CODES, EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET
+from lavender.base.exits import (
+    EXIT_BAD_INPUT,
+    EXIT_CODES,
+    EXIT_INFEASIBLE,
+    EXIT_INTERRUPTED,
+    EXIT_UNMET,
+)
 
 try:
     require_packages("the command line", "click", "rich", "threadpoolctl")
@@ -16,4 +22,12 @@ except InputError as error:
 
 from lavender.cli.entry import cli, main
 
-__all__ = ["EXIT_BAD_INPUT", "EXIT_CODES", "EXIT_INFEASIBLE", "EXIT_INTERRUPTED", "EXIT_UNMET", "cli", "main"]
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_CODES",
+    "EXIT_INFEASIBLE",
+    "EXIT_INTERRUPTED",
+    "EXIT_UNMET",
+    "cli",
+    "main",
+]

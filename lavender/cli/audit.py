@@ -30,31 +30,66 @@ from lavender.io.stored import check_writable
 @click.command()
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb|SCENE.py", type=FILE)
 @add_worlds_options(worlds=None, steps=200)
-@click.option("--engine", default="mujoco", show_default=True, help="Engine that steps the worlds.",
-              type=click.Choice(["mujoco", "mjx", "mujoco_warp", "kamino", "newton-mujoco", "genesis"]))  # fmt: skip
-@click.option("--against", type=FILE, metavar="MODEL.xml|MODEL.mjb",
-              help="Another model, such as one with other options, that solves the same steps.")  # fmt: skip
+@click.option(
+    "--engine",
+    default="mujoco",
+    show_default=True,
+    help="Engine that steps the worlds.",
+    type=click.Choice(["mujoco", "mjx", "mujoco_warp", "kamino", "newton-mujoco", "genesis"]),
+)
+@click.option(
+    "--against",
+    type=FILE,
+    metavar="MODEL.xml|MODEL.mjb",
+    help="Another model, such as one with other options, that solves the same steps.",
+)
 @limit_option
-@click.option("--keep", type=int, metavar="N",
-              help="Keep the N worst steps; default: the worst step of each of three worlds.")  # fmt: skip
-@click.option("--save-states", type=(click.Choice(["contact", "worst"]), FILE), metavar="contact|worst FILE.npz",
-              shell_complete=complete_file_or_word("contact", "worst"),
-              help="Write the states before steps with contact (about 1000 at most), or before the worst steps, for "
-              "--states of tune, slip, record and report.")  # fmt: skip
+@click.option(
+    "--keep",
+    type=int,
+    metavar="N",
+    help="Keep the N worst steps; default: the worst step of each of three worlds.",
+)
+@click.option(
+    "--save-states",
+    type=(click.Choice(["contact", "worst"]), FILE),
+    metavar="contact|worst FILE.npz",
+    shell_complete=complete_file_or_word("contact", "worst"),
+    help="Write the states before steps with contact (about 1000 at most), or before the worst steps, for "
+    "--states of tune, slip, record and report.",
+)
 @threshold_option
 @precision_option
-@click.option("--njmax", type=int, metavar="N",
-              help="Rows of a world for mujoco_warp, as in your simulation; default: as many as needed.")  # fmt: skip
-@click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
-@click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
-@click.option("--out", type=FOLDER, default=Path("lavender-audit"),
-              show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
+@click.option(
+    "--njmax",
+    type=int,
+    metavar="N",
+    help="Rows of a world for mujoco_warp, as in your simulation; default: as many as needed.",
+)
+@click.option(
+    "--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core."
+)
+@click.option(
+    "--backend", default="loky", show_default=True, help="A backend of joblib, such as dask."
+)
+@click.option(
+    "--out",
+    type=FOLDER,
+    default=Path("lavender-audit"),
+    show_default=True,
+    help="Folder of the page, the records and the worst worlds.",
+)
 @quiet_option
 @click.pass_context
 def audit(
-    context: click.Context, /, model: Path, out: Path, quiet: bool, save_states: tuple[str, Path] | None,
+    context: click.Context,
+    /,
+    model: Path,
+    out: Path,
+    quiet: bool,
+    save_states: tuple[str, Path] | None,
     **options: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Judge every step of many worlds of a MuJoCo model.
 
     MODEL is an MJCF file, or an .mjb file of a model that was changed after loading. For kamino, newton-mujoco and
@@ -80,11 +115,15 @@ def audit(
     limit_to_one_thread()
     with show_progress(quiet) as watch:
         result = run(
-            model, watch=watch,
-            keep_contact_states=save_states is not None and save_states[0] == "contact", **options,
-        )  # fmt: skip
+            model,
+            watch=watch,
+            keep_contact_states=save_states is not None and save_states[0] == "contact",
+            **options,
+        )
     if (out / "records.npz").exists():
-        os.replace(out, next(p for i in count(1) if not (p := out.with_name(f"{out.name}-{i}")).exists()))
+        os.replace(
+            out, next(p for i in count(1) if not (p := out.with_name(f"{out.name}-{i}")).exists())
+        )
     result.write(out)
     if save_states is not None:
         n = result.save_states(*save_states)

@@ -29,30 +29,57 @@ if TYPE_CHECKING:
 
 # Columns that a narrow terminal leaves out, in this order.
 NARROW_CHECK_OMITS = (
-    "objective [J]", "allowed [√J]", "floor [-]", "distance [√J]", "what ran", "time [s]", "relative [-]",
-)  # fmt: skip
+    "objective [J]",
+    "allowed [√J]",
+    "floor [-]",
+    "distance [√J]",
+    "what ran",
+    "time [s]",
+    "relative [-]",
+)
 
 
 @click.command(cls=ListCommand)
 @click.argument(
     "files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...", shell_complete=complete_case_or_file
 )
-@click.option("--solvers", type=ListType(str), shell_complete=complete_solver,
-              help="Solvers by name; default: all that accept the problem.")  # fmt: skip
-@click.option("--reference", default="osqp", show_default=True, shell_complete=complete_solver,
-              help="Reference solver, with which the others are compared.")  # fmt: skip
-@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
+@click.option(
+    "--solvers",
+    type=ListType(str),
+    shell_complete=complete_solver,
+    help="Solvers by name; default: all that accept the problem.",
+)
+@click.option(
+    "--reference",
+    default="osqp",
+    show_default=True,
+    shell_complete=complete_solver,
+    help="Reference solver, with which the others are compared.",
+)
+@click.option(
+    "--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach."
+)
 @click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
 @precision_option
 @threshold_option
 @click.option(
-    "--json", "as_json", is_flag=True, help="Print the comparisons as JSON, one entry for each problem."
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print the comparisons as JSON, one entry for each problem.",
 )
 @click.pass_context
 def check(
-    context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None, reference: str, tol: float,
-    time_limit: float | None, precision: str | None, threshold: float, as_json: bool,
-) -> None:  # fmt: skip
+    context: click.Context,
+    files: tuple[str, ...],
+    solvers: tuple[str, ...] | None,
+    reference: str,
+    tol: float,
+    time_limit: float | None,
+    precision: str | None,
+    threshold: float,
+    as_json: bool,
+) -> None:
     """Compare solvers with a reference solver and with the judge.
 
     The judge checks the claim of each solver. For a case of the suite whose exact solution is known, the distance of
@@ -93,9 +120,13 @@ def check(
     check_time_limit(time_limit)
     for item in report.resolve_sources(files):
         with errors(item):
-            comparison = cross_check(item.problem, solvers, reference, tol=tol, time_limit=time_limit)
+            comparison = cross_check(
+                item.problem, solvers, reference, tol=tol, time_limit=time_limit
+            )
             stored = item.judge_stored_answer(precision, threshold)
-            if item.name != item.problem.name:  # The description begins with the problem's own name.
+            if (
+                item.name != item.problem.name
+            ):  # The description begins with the problem's own name.
                 show(item.name, style="bold")
             show(comparison.description, style="bold" if item.name == item.problem.name else "")
             if comparison.reference is None and comparison.reference_note != reason:
@@ -105,11 +136,16 @@ def check(
             if (exact := _describe_distances(item, comparison)) is not None:
                 show(exact)
             entries.append(
-                {"case": item.name, "rows": item.problem.m, "law": item.problem.law, "reference": comparison.reference,
-                 "solvers": comparison.frame.to_dict("records"),
-                 "stored_verdict": None if stored is None else stored.verdict,
-                 "stored_velocity_error": None if stored is None else stored.velocity}
-            )  # fmt: skip
+                {
+                    "case": item.name,
+                    "rows": item.problem.m,
+                    "law": item.problem.law,
+                    "reference": comparison.reference,
+                    "solvers": comparison.frame.to_dict("records"),
+                    "stored_verdict": None if stored is None else stored.verdict,
+                    "stored_velocity_error": None if stored is None else stored.velocity,
+                }
+            )
             if stored is not None:
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
@@ -119,14 +155,19 @@ def check(
                 show(f"    worst row {stored.worst_name or 'none'}: {error}")
             contradicted += len(comparison.contradicted)
             unaccepted += len(comparison.refused) == len(comparison.rows)
-            if solvers or len(comparison.unsolved) + len(comparison.refused) == len(comparison.rows):
+            if solvers or len(comparison.unsolved) + len(comparison.refused) == len(
+                comparison.rows
+            ):
                 unsolved += len(comparison.unsolved)
     if contradicted:
         show(f"{contradicted} claims are contradicted", style="bold red")
     if unsolved:
         show(f"{unsolved} of the solves did not solve their problem", style="bold red")
     if unaccepted:
-        show(f"{format_count(unaccepted, 'problem')} not accepted by any of these solvers", style="bold red")
+        show(
+            f"{format_count(unaccepted, 'problem')} not accepted by any of these solvers",
+            style="bold red",
+        )
     if judges_stored and not solutions:
         raise InputError(
             "--precision and --threshold apply to stored solutions, and no file has one (entry `impulse`): "

@@ -49,14 +49,18 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return a command; an unknown name raises UnknownName."""
         if cmd_name not in COMMANDS:
-            if not ctx.resilient_parsing:  # While a shell completes words, unknown names raise no error.
+            if (
+                not ctx.resilient_parsing
+            ):  # While a shell completes words, unknown names raise no error.
                 raise UnknownName("command", cmd_name, COMMANDS)
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
         return command
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(
+    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
+)
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
     """Solve constraint problems of rigid-body simulation, and compare the error and the cost of solvers.

@@ -33,7 +33,9 @@ class Measured(NamedTuple):
 
     lines: pd.DataFrame
     stopped: bool  # Whether Ctrl-C ended the measurement.
-    reuse_note: str = ""  # Sentence on the number of reused runs; empty if this call measured all of them.
+    reuse_note: str = (
+        ""  # Sentence on the number of reused runs; empty if this call measured all of them.
+    )
 
 
 def is_campaign(context: click.Context) -> bool:
@@ -54,25 +56,33 @@ def measure_files(
 
     limit_to_one_thread()
     options = context.params
-    report.select_solver_names(options["solvers"])  # Reject unknown names before a problem is loaded.
+    report.select_solver_names(
+        options["solvers"]
+    )  # Reject unknown names before a problem is loaded.
     solvers = options["solvers"]
     if options["sweeps"] and not solvers:
         specs = registry.specs()
         solvers = [
-            name for name in report.select_solver_names(None) if specs[name].order and specs[name].resumable
+            name
+            for name in report.select_solver_names(None)
+            if specs[name].order and specs[name].resumable
         ]
     plan, workers = _make_plan(context, files)
     reused = 0
     with report.Store(path) as store:
         items = report.resolve_sources(list(files), options["sequence"])
-        if is_option_set(context, "sequence_time_limit") and not any(item.sequence for item in items):
+        if is_option_set(context, "sequence_time_limit") and not any(
+            item.sequence for item in items
+        ):
             raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
         if options["sweeps"] and not any(item.sequence for item in items):
             raise InputError(
                 "--sweeps needs recorded steps in sequence: a folder that lv.io.Recorder(every=1), `lavender record` "
                 "or `lavender run --record` wrote, or --sequence for any folder of consecutive steps"
             )
-        before = {name: machine["started"] for name, machine in select_machines(store.lines).items()}
+        before = {
+            name: machine["started"] for name, machine in select_machines(store.lines).items()
+        }
         rows: list[dict[str, Any]] = []
 
         def count_event(event: Event) -> None:
@@ -83,9 +93,15 @@ def measure_files(
         stopped = False
         try:
             report.run(
-                items, solvers, plan, store, watch=count_event, into=rows,
-                reuse=not options["no_reuse"], **workers,
-            )  # fmt: skip
+                items,
+                solvers,
+                plan,
+                store,
+                watch=count_event,
+                into=rows,
+                reuse=not options["no_reuse"],
+                **workers,
+            )
         except KeyboardInterrupt:
             if not rows:
                 raise
@@ -135,7 +151,13 @@ def show_page(page: ResultPage, folder: Path, is_quiet: bool = False) -> None:
 @contextlib.contextmanager
 def show_progress(is_quiet: bool = False) -> Iterator[Callable[[Event], None]]:
     """Yield a callback that shows progress on stderr if it is a terminal, unless `is_quiet`."""
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = make_console(stderr=True)
     columns = (
@@ -147,17 +169,24 @@ def show_progress(is_quiet: bool = False) -> Iterator[Callable[[Event], None]]:
     drawn = 0.0
     # Without `auto_refresh`: the thread that redraws would disturb the times that are measured.
     with Progress(
-        *columns, console=console, auto_refresh=False, transient=True,
+        *columns,
+        console=console,
+        auto_refresh=False,
+        transient=True,
         disable=is_quiet or not console.is_terminal,
-    ) as progress:  # fmt: skip
+    ) as progress:
         task = progress.add_task("starting", total=None)
 
         def show_event(event: Event) -> None:
             nonlocal drawn
             if (now := time.monotonic()) - drawn > REDRAW_INTERVAL:
                 drawn = now
-                current = ": ".join(filter(None, (event.phase, f"{event.case} {event.solver}".strip())))
-                progress.update(task, description=current, completed=event.done, total=event.total or None)
+                current = ": ".join(
+                    filter(None, (event.phase, f"{event.case} {event.solver}".strip()))
+                )
+                progress.update(
+                    task, description=current, completed=event.done, total=event.total or None
+                )
                 progress.refresh()
 
         yield show_event

@@ -31,8 +31,15 @@ MIN_TERMINAL_WIDTH = 60  # [columns] Tables are formatted for at least this widt
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-Option = tuple[tuple[str, ...], dict[str, Any]]  # Positional (names) and keyword arguments of `click.option`.
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+Option = tuple[
+    tuple[str, ...], dict[str, Any]
+]  # Positional (names) and keyword arguments of `click.option`.
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+)
 NUMBER = re.compile(r"[\d.]+(e[-+]?\d+)?", re.IGNORECASE)  # Matches a word of a list of numbers.
 
 
@@ -53,7 +60,9 @@ def _is_solver(word: str) -> bool:
     """Return whether a word names a solver, perhaps misspelt, and no family of the suite and no file."""
     from lavender import suite
 
-    return word not in suite.FAMILIES and not set(word) & set("(*?[/\\.") and not Path(word).exists()
+    return (
+        word not in suite.FAMILIES and not set(word) & set("(*?[/\\.") and not Path(word).exists()
+    )
 
 
 class ListCommand(click.Command):
@@ -70,7 +79,12 @@ class ListCommand(click.Command):
         joined: list[str] = []
         belongs: Callable[[str], Any] | None = None
         for i, word in enumerate(args):
-            if belongs and args[i - 1] not in self.TESTS and not word.startswith("-") and belongs(word):
+            if (
+                belongs
+                and args[i - 1] not in self.TESTS
+                and not word.startswith("-")
+                and belongs(word)
+            ):
                 joined[-1] += f",{word}"
                 continue
             joined.append(word)
@@ -94,7 +108,9 @@ def make_console(stderr: bool = False) -> Console:
     """Return a console that does not cut off names; in a file or pipe, lines are as long as the tables need."""
     from rich.console import Console
 
-    has_width = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
+    has_width = (
+        Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
+    )
     width = max(shutil.get_terminal_size().columns, MIN_TERMINAL_WIDTH) if has_width else 10_000
     return Console(stderr=stderr, width=width)
 
@@ -117,18 +133,36 @@ def add_options(
     return decorate
 
 
-def add_worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def add_worlds_options(
+    worlds: int | None, steps: int
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
     options: list[Option] = [
-        (("--worlds",), {"default": worlds, "type": int, "help": "Number of worlds; the first is the one of `lavender "
-                         "record`." + " Default: as many as take about a minute." * (worlds is None)}),
+        (
+            ("--worlds",),
+            {
+                "default": worlds,
+                "type": int,
+                "help": "Number of worlds; the first is the one of `lavender "
+                "record`." + " Default: as many as take about a minute." * (worlds is None),
+            },
+        ),
         (("--steps",), {"default": steps, "help": "Steps of each world."}),
-        (("--spread",), {"default": None, "type": float, "metavar": "M/S",
-                         "help": "Standard deviation by which the initial velocities of the other worlds differ. "
-                         "Default: the largest of 0.1, 0.01, 0.001 and 0 with which trial worlds do not diverge."}),
-    ]  # fmt: skip
+        (
+            ("--spread",),
+            {
+                "default": None,
+                "type": float,
+                "metavar": "M/S",
+                "help": "Standard deviation by which the initial velocities of the other worlds differ. "
+                "Default: the largest of 0.1, 0.01, 0.001 and 0 with which trial worlds do not diverge.",
+            },
+        ),
+    ]
     options += [
-        (names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed", "--states")
+        (names, more)
+        for names, more in RECORDING_OPTIONS
+        if names[0] in ("--controls", "--seed", "--states")
     ]
     return add_options(options, show_default=True)
 
@@ -140,26 +174,38 @@ def reject_options_without_effect(context: click.Context, **conditions: Any) -> 
     """
     for name, (words, names) in OPTIONS_WITHOUT_EFFECT.items():
         for parameter in context.command.params if conditions.get(name) else ():
-            is_listed = parameter.name in names if names[0] != "all but" else parameter.name not in names
+            is_listed = (
+                parameter.name in names if names[0] != "all but" else parameter.name not in names
+            )
             if parameter.name and is_listed and is_option_set(context, parameter.name):
                 raise InputError(f"{parameter.opts[0]} has no effect {words}: leave it out")
 
 
 #: Option of commands that judge solutions of an engine.
 precision_option = click.option(
-    "--precision", type=click.Choice(["float64", "float32"]),
+    "--precision",
+    type=click.Choice(["float64", "float32"]),
     help="Precision in which the engine computed its solutions; default: the precision of the problem, or float64.",
-)  # fmt: skip
-THRESHOLD: Option = (("--threshold",), {
-    "type": float, "default": 1e-6, "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
-})  # fmt: skip
+)
+THRESHOLD: Option = (
+    ("--threshold",),
+    {
+        "type": float,
+        "default": 1e-6,
+        "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
+    },
+)
 threshold_option = add_options([THRESHOLD], show_default=True)
 #: Option of the commands with pages that compare with a velocity error.
-LIMIT: Option = (("--max-velocity-error",), {
-    "type": float, "metavar": "M/S",
-    "help": "Velocity error with which the page compares [m/s, rad/s on angular rows]; default: 1 mm/s. If given, "
-    "an audit exits with 1 above it, and tune recommends a setting within it.",
-})  # fmt: skip
+LIMIT: Option = (
+    ("--max-velocity-error",),
+    {
+        "type": float,
+        "metavar": "M/S",
+        "help": "Velocity error with which the page compares [m/s, rad/s on angular rows]; default: 1 mm/s. If given, "
+        "an audit exits with 1 above it, and tune recommends a setting within it.",
+    },
+)
 limit_option = add_options([LIMIT])
 #: Option of the commands that write a page.
 quiet_option = click.option(
@@ -169,51 +215,122 @@ quiet_option = click.option(
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
     (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
-    (("--controls", "control"), {"default": "random", "metavar": "zero|random|hold|FILE",
-                                 "shell_complete": complete_file_or_word("zero", "random", "hold"),
-                                 "help": "MODEL.xml: its controls. hold: those of the start state. FILE: .npy of shape "
-                                 "(any, nu), repeated."}),
+    (
+        ("--controls", "control"),
+        {
+            "default": "random",
+            "metavar": "zero|random|hold|FILE",
+            "shell_complete": complete_file_or_word("zero", "random", "hold"),
+            "help": "MODEL.xml: its controls. hold: those of the start state. FILE: .npy of shape "
+            "(any, nu), repeated.",
+        },
+    ),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
-    (("--states",), {"default": None, "metavar": "FILE|keyframes", "shell_complete": complete_file_or_word("keyframes"),
-                     "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
-                     "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
-                     "arrays of MjData, such as `lavender audit` writes. keyframes: the keyframes of the model."}),
-)  # fmt: skip
+    (
+        ("--states",),
+        {
+            "default": None,
+            "metavar": "FILE|keyframes",
+            "shell_complete": complete_file_or_word("keyframes"),
+            "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
+            "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
+            "arrays of MjData, such as `lavender audit` writes. keyframes: the keyframes of the model.",
+        },
+    ),
+)
 # Parameters of RECORDING_OPTIONS.
 RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 #: Conditions under which options have no effect: the words of the message, and the options' parameters.
 OPTIONS_WITHOUT_EFFECT: dict[str, tuple[str, tuple[str, ...]]] = {
     "is_list": ("with --list", ("all but", "listed")),
-    "shows_records": ("if records are shown again, since nothing is solved",
-                      ("all but", "files", "out", "compare", "time_budgets", "tables", "no_figures", "solvers",
-                       "figure_kinds", "columns", "quiet")),
-    "is_campaign": ("with --workers, which measures no times and ends by iterations",
-                    ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence")),
-    "sweeps": ("with --sweeps, which measures fixed numbers of sweeps",
-               ("tolerances", "repeats", "time_budgets", "workers", "backend")),
+    "shows_records": (
+        "if records are shown again, since nothing is solved",
+        (
+            "all but",
+            "files",
+            "out",
+            "compare",
+            "time_budgets",
+            "tables",
+            "no_figures",
+            "solvers",
+            "figure_kinds",
+            "columns",
+            "quiet",
+        ),
+    ),
+    "is_campaign": (
+        "with --workers, which measures no times and ends by iterations",
+        ("repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence"),
+    ),
+    "sweeps": (
+        "with --sweeps, which measures fixed numbers of sweeps",
+        ("tolerances", "repeats", "time_budgets", "workers", "backend"),
+    ),
     "without_model": ("without a MODEL.xml", RECORDING_NAMES),
     "without_random": ("without --controls random", ("seed",)),
     "without_record": ("without --record", ("replace",)),
     "without_budgets": ("on solvers that cannot stop after any iteration", ("budgets",)),
     "other_engine": ("with another --engine than mujoco", ("workers", "backend", "precision")),
-}  # fmt: skip
+}
 
 #: Options of the commands that measure, as fields of `lavender.report.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": ListType(str), "shell_complete": complete_solver,
-                   "help": "Solvers by name; default: all that are installed."}),
-    ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
-                  "help": "Relative residuals to reach."}),
-    ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
-                   "help": "Numbers of iterations to run exactly."}),
-    ("--repeats", {"type": int, "default": 3, "show_default": True,
-                   "help": "Repetitions of each solve; minimum and median are recorded."}),
-    ("--time-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
-    ("--sequence-time-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s."}),
-)  # fmt: skip
+    (
+        "--solvers",
+        {
+            "type": ListType(str),
+            "shell_complete": complete_solver,
+            "help": "Solvers by name; default: all that are installed.",
+        },
+    ),
+    (
+        "--tolerances",
+        {
+            "type": ListType(float),
+            "default": "1e-3,1e-6,1e-9",
+            "show_default": True,
+            "help": "Relative residuals to reach.",
+        },
+    ),
+    (
+        "--budgets",
+        {
+            "type": ListType(int),
+            "default": "4,8,16,32,64",
+            "show_default": True,
+            "help": "Numbers of iterations to run exactly.",
+        },
+    ),
+    (
+        "--repeats",
+        {
+            "type": int,
+            "default": 3,
+            "show_default": True,
+            "help": "Repetitions of each solve; minimum and median are recorded.",
+        },
+    ),
+    (
+        "--time-limit",
+        {
+            "type": float,
+            "default": None,
+            "metavar": "S",
+            "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite.",
+        },
+    ),
+    (
+        "--sequence-time-limit",
+        {
+            "type": float,
+            "default": None,
+            "metavar": "S",
+            "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s.",
+        },
+    ),
+)
 plan_options = add_options([((name,), more) for name, more in PLAN_OPTIONS])
 
 
@@ -276,7 +393,9 @@ def parse_parameters(assignments: tuple[str, ...]) -> dict[str, Any]:
     for word in assignments:
         name, equals, value = word.partition("=")
         if not equals or not name:
-            raise InputError(f"--set {word!r} has no name or no value; NAME=VALUE is needed, such as n=4")
+            raise InputError(
+                f"--set {word!r} has no name or no value; NAME=VALUE is needed, such as n=4"
+            )
         constants = {"true": True, "false": False, "none": None}
         if value.lower() in constants:
             parameters[name] = constants[value.lower()]

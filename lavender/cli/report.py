@@ -38,40 +38,83 @@ from lavender.report.drawing import FILE_KINDS
 )
 @plan_options
 @click.option(
-    "--out", type=PATH, default=Path("lavender-report"), show_default=True, help="Folder of the report."
+    "--out",
+    type=PATH,
+    default=Path("lavender-report"),
+    show_default=True,
+    help="Folder of the report.",
 )
-@click.option("--sequence/--no-sequence", default=None,
-              help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. "
-              "Default: only folders of recorded steps, as `lavender run --record` and `lavender record` write them.",
-)  # fmt: skip
-@click.option("--workers", type=int,
-              help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
-)  # fmt: skip
-@click.option("--backend", default="loky", show_default=True,
-              help="The same with the workers of a backend of joblib, such as dask.")  # fmt: skip
-@click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
-@click.option("--time-budgets", type=ListType(float), default=(), metavar="S,S,...",
-              help="Times in seconds for which the report lists the best solver; default: three decades about the "
-              "fastest.")  # fmt: skip
-@click.option("--sweeps", is_flag=True,
-              help="Answer how many sweeps a step needs: measure only fixed numbers of sweeps (--budgets) of the "
-              "solvers that sweep, on recorded steps in sequence.")  # fmt: skip
+@click.option(
+    "--sequence/--no-sequence",
+    default=None,
+    help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. "
+    "Default: only folders of recorded steps, as `lavender run --record` and `lavender record` write them.",
+)
+@click.option(
+    "--workers",
+    type=int,
+    help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
+)
+@click.option(
+    "--backend",
+    default="loky",
+    show_default=True,
+    help="The same with the workers of a backend of joblib, such as dask.",
+)
+@click.option(
+    "--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder)."
+)
+@click.option(
+    "--time-budgets",
+    type=ListType(float),
+    default=(),
+    metavar="S,S,...",
+    help="Times in seconds for which the report lists the best solver; default: three decades about the "
+    "fastest.",
+)
+@click.option(
+    "--sweeps",
+    is_flag=True,
+    help="Answer how many sweeps a step needs: measure only fixed numbers of sweeps (--budgets) of the "
+    "solvers that sweep, on recorded steps in sequence.",
+)
 @recording_options
 @limit_option
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
-@click.option("--no-figures", is_flag=True,
-              help="Write no figures; they take the largest part of the time of writing.")  # fmt: skip
-@click.option("--figure-kinds", type=ListType(click.Choice(FILE_KINDS)), default="pdf,svg,png", show_default=True,
-              help="Formats of the figures in OUT/figures.")  # fmt: skip
-@click.option("--columns", type=ListType(str), default=(), metavar="A,B,...",
-              help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
-              "false; default: solved and all tolerances.")  # fmt: skip
+@click.option(
+    "--no-figures",
+    is_flag=True,
+    help="Write no figures; they take the largest part of the time of writing.",
+)
+@click.option(
+    "--figure-kinds",
+    type=ListType(click.Choice(FILE_KINDS)),
+    default="pdf,svg,png",
+    show_default=True,
+    help="Formats of the figures in OUT/figures.",
+)
+@click.option(
+    "--columns",
+    type=ListType(str),
+    default=(),
+    metavar="A,B,...",
+    help="Columns of OUT/tables/solvers.tex: solved, a tolerance such as 1e-6, ratio, slowest, accepted, "
+    "false; default: solved and all tolerances.",
+)
 @quiet_option
-@click.option("--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing.")
+@click.option(
+    "--list", "listed", is_flag=True, help="List the cases of the built-in suite; measure nothing."
+)
 @click.pass_context
 def report(
-    context: click.Context, /, files: tuple[str, ...], out: Path, listed: bool, quiet: bool, **options: Any
+    context: click.Context,
+    /,
+    files: tuple[str, ...],
+    out: Path,
+    listed: bool,
+    quiet: bool,
+    **options: Any,
 ) -> None:
     """Measure the time and the error of solvers on problems.
 
@@ -105,11 +148,14 @@ def report(
     specs = [] if shows_records else [registry.get(name) for name in options["solvers"] or ()]
     has_model = any(Path(f).suffix.lower() in MODEL_SUFFIXES for f in files)
     reject_options_without_effect(
-        context, shows_records=shows_records, is_campaign=not shows_records and is_campaign(context),
-        sweeps=options["sweeps"], without_model=not has_model,
+        context,
+        shows_records=shows_records,
+        is_campaign=not shows_records and is_campaign(context),
+        sweeps=options["sweeps"],
+        without_model=not has_model,
         without_random=has_model and context.params["control"] != "random",
         without_budgets=bool(specs) and not any(s.resumable and not s.exact for s in specs),
-    )  # fmt: skip
+    )
     check_writable(out, folder=True)
     used_folders: set[Path] = set()
     recording = {name: options[name] for name in RECORDING_NAMES}
@@ -145,7 +191,9 @@ def report(
         # Write the files before printing, as a closed pipe can end the command while it prints. After Ctrl-C, the page
         # has no figures, so that the prompt is back soon.
         try:
-            index = write(shown, out, figures=not (options["no_figures"] or measured.stopped), watch=watch)
+            index = write(
+                shown, out, figures=not (options["no_figures"] or measured.stopped), watch=watch
+            )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"the page is not complete; {path} has all runs, and the same command shows them"
@@ -179,10 +227,14 @@ def _list_suite() -> None:
     print_escaped("")
     for name, names in suite.SETS.items():
         print_escaped(f"@{name}", style="bold")
-        print_escaped(f"    {len(names)} cases: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}")
+        print_escaped(
+            f"    {len(names)} cases: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        )
 
 
-def _record_model(word: str, out: Path, used_folders: set[Path], recording: Mapping[str, Any]) -> str:
+def _record_model(
+    word: str, out: Path, used_folders: set[Path], recording: Mapping[str, Any]
+) -> str:
     """Record the steps of a model *.xml or *.mjb in the report's folder `out`, and return their folder.
 
     Any other word is returned unchanged. The new folder is added to `used_folders`. Its name contains the folder and
@@ -194,7 +246,8 @@ def _record_model(word: str, out: Path, used_folders: set[Path], recording: Mapp
     from lavender.io.recording import record_file
     from lavender.report.text import make_file_name
 
-    first, n = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}"), 1
+    first = out / "recorded" / make_file_name(f"{path.resolve().parent.name}-{path.stem}")
+    n = 1
     folder = first
     while folder in used_folders:
         n += 1

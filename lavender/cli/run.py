@@ -25,32 +25,62 @@ from lavender.io.stored import check_writable
 @click.argument("scene", shell_complete=complete_scene)
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option("--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64.")
-@click.option("--warm-start/--no-warm-start", default=None,
-              help="Carry impulses from step to step.  [default: warm-start]")  # fmt: skip
-@click.option("--order",
-              help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
-              "Default: alternating.")  # fmt: skip
-@click.option("--solver", shell_complete=complete_solver,
-              help="Solver of each step, by name. Default: sequential_impulses.")  # fmt: skip
-@click.option("--velocity-tol", type=float, metavar="M/S",
-              help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
-)  # fmt: skip
-@click.option("--set", "parameters", multiple=True, metavar="NAME=VALUE",
-              help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.")  # fmt: skip
-@click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
+@click.option(
+    "--warm-start/--no-warm-start",
+    default=None,
+    help="Carry impulses from step to step.  [default: warm-start]",
+)
+@click.option(
+    "--order",
+    help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
+    "Default: alternating.",
+)
+@click.option(
+    "--solver",
+    shell_complete=complete_solver,
+    help="Solver of each step, by name. Default: sequential_impulses.",
+)
+@click.option(
+    "--velocity-tol",
+    type=float,
+    metavar="M/S",
+    help="With --solver: velocity error that each solve must reach [m/s, rad/s], in place of its tolerance.",
+)
+@click.option(
+    "--set",
+    "parameters",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.",
+)
+@click.option(
+    "--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step."
+)
 @click.option("--plot", type=PATH, help="Write a figure of the run (.svg, .png).")
 @click.option("--trace", type=PATH, help="Write the values of every step (.csv).")
 @click.option("--record", type=PATH, help="Write the problem of every step (.npz) to this folder.")
 @click.option(
-    "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
+    "--replace",
+    is_flag=True,
+    help="With --record: first delete the problems of an earlier recording.",
 )
 @click.option("--film", type=PATH, help="Write a film of the run (.gif).")
 @click.pass_context
 def run(
-    context: click.Context, /, scene: str, steps: int, parameters: tuple[str, ...], residual: bool, plot: Path | None,
-    trace: Path | None, record: Path | None, replace: bool, film: Path | None, velocity_tol: float | None,
+    context: click.Context,
+    /,
+    scene: str,
+    steps: int,
+    parameters: tuple[str, ...],
+    residual: bool,
+    plot: Path | None,
+    trace: Path | None,
+    record: Path | None,
+    replace: bool,
+    film: Path | None,
+    velocity_tol: float | None,
     **scene_options: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Simulate a scene of the gallery.
 
     With --record, its steps are written as a sequence for `lavender report`.
@@ -74,7 +104,9 @@ def run(
     for path in files.values():
         check_writable(path)
     if film is not None and film.suffix.lower() != ".gif":
-        raise InputError(f"--film {film} is of format {film.suffix!r}; a name that ends in .gif is needed")
+        raise InputError(
+            f"--film {film} is of format {film.suffix!r}; a name that ends in .gif is needed"
+        )
     live = sys.stdout.isatty()
 
     def show(text: str) -> None:

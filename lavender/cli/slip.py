@@ -15,16 +15,32 @@ from lavender.io.stored import check_writable
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
-@click.option("--states", metavar="FILE.npz|keyframes", shell_complete=complete_file_or_word("keyframes"),
-              help="States to explain, such as states.npz of an audit; default: the initial state.")  # fmt: skip
-@click.option("--steps", type=click.IntRange(min=1), default=1, show_default=True,
-              help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
-@click.option("--contact", "contacts", multiple=True, metavar="GEOM",
-              help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
-@click.option("--out", type=FOLDER, help="Folder of a page with the slip over time and of numbers.json.")
+@click.option(
+    "--states",
+    metavar="FILE.npz|keyframes",
+    shell_complete=complete_file_or_word("keyframes"),
+    help="States to explain, such as states.npz of an audit; default: the initial state.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Steps simulated from each state, with its controls; the last one is explained.",
+)
+@click.option(
+    "--contact",
+    "contacts",
+    multiple=True,
+    metavar="GEOM",
+    help="Contacts of geoms whose names contain this; may be repeated. Default: all.",
+)
+@click.option(
+    "--out", type=FOLDER, help="Folder of a page with the slip over time and of numbers.json."
+)
 def slip(
     model: Path, states: str | None, steps: int, contacts: tuple[str, ...], out: Path | None
-) -> None:  # fmt: skip
+) -> None:
     """Explain why contacts of a MuJoCo model slip.
 
     MODEL is an MJCF or .mjb file. The first table shows the speed of each contact along its surface after the step, and
@@ -47,7 +63,9 @@ def slip(
     limit_to_one_thread()
     mj, loaded = load_model(model)
     with show_progress() as watch:
-        result = explain_slip_of_states(loaded, states, contacts=contacts or None, steps=steps, watch=watch)
+        result = explain_slip_of_states(
+            loaded, states, contacts=contacts or None, steps=steps, watch=watch
+        )
     if can_sleep(mj, loaded):
         print_escaped('Sleep was off, although the model has <flag sleep="enable"/>.')
     for note in result.notes:
@@ -61,7 +79,8 @@ def slip(
             f"{model}: no contact with friction in these states; give other --states, or more --steps"
         )
         raise click.exceptions.Exit(EXIT_UNMET)
-    console, worst = make_console(), result.worst
+    console = make_console()
+    worst = result.worst
     print_table(console, result.table, optional=("points",))
     n = len(result.explanations)
     print_escaped(
@@ -71,7 +90,9 @@ def slip(
         print_escaped(f"\nState {worst.state} (counted from 0) has the fastest contact:")
     print_escaped("\n".join(worst.sentences))
     if worst.remedies:
-        print_escaped(f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:")
+        print_escaped(
+            f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:"
+        )
         print_table(console, worst.remedies_table)
         print_escaped("\n".join(worst.advice))
     if out is not None:

@@ -25,21 +25,42 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
 
 @click.command()
 @click.argument("file", shell_complete=complete_case_or_file)
-@click.option("--solver", default="auto", show_default=True, shell_complete=complete_solver,
-              help="Name of the solver; see `lavender solvers`.")  # fmt: skip
-@click.option("--tol", type=float, default=1e-6, show_default=True,
-              help="Relative residual to reach; 0 runs exactly --max-iter iterations.")  # fmt: skip
-@click.option("--velocity-tol", type=float, metavar="M/S",
-              help="Velocity error of every row to reach [m/s], in place of --tol.")  # fmt: skip
+@click.option(
+    "--solver",
+    default="auto",
+    show_default=True,
+    shell_complete=complete_solver,
+    help="Name of the solver; see `lavender solvers`.",
+)
+@click.option(
+    "--tol",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
+)
+@click.option(
+    "--velocity-tol",
+    type=float,
+    metavar="M/S",
+    help="Velocity error of every row to reach [m/s], in place of --tol.",
+)
 @click.option("--max-iter", type=int, help="Largest number of iterations; default: the solver's.")
 @click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time.")
 @click.option("--order", help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, help="Seed of a random order.")
-@click.option("--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file.")
 @click.option(
-    "--json", "as_json", is_flag=True, help="Print the judged result as JSON, with impulse and slack."
+    "--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file."
 )
-def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool, **options: Any) -> None:
+@click.option(
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print the judged result as JSON, with impulse and slack.",
+)
+def solve(
+    file: str, solver: str, tol: float, output: Path | None, as_json: bool, **options: Any
+) -> None:
     """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. A quadratic program is solved by `lavender.solve_qp`; x, its multipliers y, z
@@ -56,7 +77,12 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     (item, *more) = report.resolve_sources([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
-    if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
+    if (
+        output is not None
+        and output.exists()
+        and Path(item.source).exists()
+        and output.samefile(item.source)
+    ):
         raise InputError(f"--output {output} would overwrite the problem: give another file")
     options = {name: value for name, value in options.items() if value is not None}
     case = make_case(item.problem)
@@ -67,17 +93,31 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
     solution = case.solve(solver, tol=tol, **options)
     if output is not None:
         results = _collect_results(item.problem, solution, SAVED_RESIDUAL_FIELDS)
-        write_arrays(output, results | {"status": solution.status.name, "solver": solution.solver.name})
+        write_arrays(
+            output, results | {"status": solution.status.name, "solver": solution.solver.name}
+        )
     if as_json:
         law = item.problem.law if item.problem.qp is None else "program"
-        judged = {} if item.problem.qp is not None else {
-            "verdict": solution.residual.verdict, "worst_row": solution.residual.worst_label,
-        }  # fmt: skip
+        judged = (
+            {}
+            if item.problem.qp is not None
+            else {
+                "verdict": solution.residual.verdict,
+                "worst_row": solution.residual.worst_label,
+            }
+        )
         results = {
-            "case": item.name, "law": law, "rows": item.problem.m, "solver": solution.solver.name,
-            "status": solution.status.name, "success": solution.success, **judged,
-            **_collect_results(item.problem, solution, ("relative", "energy", "velocity", "roundoff_floor")),
-        }  # fmt: skip
+            "case": item.name,
+            "law": law,
+            "rows": item.problem.m,
+            "solver": solution.solver.name,
+            "status": solution.status.name,
+            "success": solution.success,
+            **judged,
+            **_collect_results(
+                item.problem, solution, ("relative", "energy", "velocity", "roundoff_floor")
+            ),
+        }
         click.echo(format_json(results, indent=1))
     else:
         start = "zero impulses" if item.problem.guess is None else "the stored impulses"
@@ -94,7 +134,9 @@ def solve(file: str, solver: str, tol: float, output: Path | None, as_json: bool
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     if errors := case.describe_zero(solution):
         if not as_json:
-            click.echo(f"nothing to do: the zero impulse is a solution; this result differs by {errors}")
+            click.echo(
+                f"nothing to do: the zero impulse is a solution; this result differs by {errors}"
+            )
         return
     if tol > 0.0 and not case.is_solved(solution):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 #: Words of the column "capabilities": (field of `SolverSpec`, word, explanation).
 CAPABILITIES = (
     ("exact", "exact", "ends after finitely many steps or at rounding accuracy"),
-    ("box_friction_laws", "boxes", "accepts contacts with friction that bound each tangent separately"),
+    (
+        "box_friction_laws",
+        "boxes",
+        "accepts contacts with friction that bound each tangent separately",
+    ),
     ("impulse", "warm start", "starts from impulse="),
     ("resumable", "budget", "runs exactly max_iter iterations with tol=0"),
     ("order", "order", "accepts order="),
@@ -79,7 +83,10 @@ def _describe_solver(name: str) -> None:
     elif spec.external:
         lines += ["Its behaviour was not observed."]
     if measures:
-        lines += ["lavender therefore calls it as follows:", *(f"- {sentence}" for sentence in measures)]
+        lines += [
+            "lavender therefore calls it as follows:",
+            *(f"- {sentence}" for sentence in measures),
+        ]
     console = make_console()
     for line in lines:
         console.print(escape_markup(line), highlight=False)
@@ -94,11 +101,16 @@ def _list_solvers() -> None:
     reasons = registry.known()
     rows = [
         {
-            "solver": name, "laws": _join_in_order(LAWS, spec.laws), "reads": _join_in_order(OPERATORS, spec.operators),
-            "capabilities": _get_capabilities(spec), "description": reasons[name] or spec.summary,
+            "solver": name,
+            "laws": _join_in_order(LAWS, spec.laws),
+            "reads": _join_in_order(OPERATORS, spec.operators),
+            "capabilities": _get_capabilities(spec),
+            "description": reasons[name] or spec.summary,
         }
-        for name, spec in sorted(registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0]))
-    ]  # fmt: skip
+        for name, spec in sorted(
+            registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0])
+        )
+    ]
     console = make_console()
     print_table(console, pd.DataFrame(rows), optional=("reads",))
     console.print()

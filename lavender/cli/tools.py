@@ -28,8 +28,12 @@ from lavender.io.stored import check_writable
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILES...", shell_complete=complete_case_or_file)
-@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
+@click.argument(
+    "files", nargs=-1, required=True, metavar="FILES...", shell_complete=complete_case_or_file
+)
+@click.option(
+    "--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach."
+)
 @click.option("--json", "as_data", is_flag=True, help="Print one decision trace per line as JSON.")
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
     """Print the decision trace of `auto` on problems.
@@ -60,12 +64,20 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
 @recording_options
 @click.option("--out", required=True, type=FOLDER, help="Folder for the problems.")
 @click.option(
-    "--replace", is_flag=True, help="First delete the problems of an earlier recording in the folder."
+    "--replace",
+    is_flag=True,
+    help="First delete the problems of an earlier recording in the folder.",
 )
 @precision_option
 @click.pass_context
 def record(
-    context: click.Context, /, model: Path, out: Path, steps: int, precision: str | None, **options: Any
+    context: click.Context,
+    /,
+    model: Path,
+    out: Path,
+    steps: int,
+    precision: str | None,
+    **options: Any,
 ) -> None:
     """Simulate a MuJoCo model and write its constraint problems.
 
@@ -88,10 +100,18 @@ def record(
 @click.command()
 @click.argument("name", shell_complete=complete_solver)
 @click.option(
-    "--list", "list_only", is_flag=True, help="List the requirements that apply to the solver; run nothing."
+    "--list",
+    "list_only",
+    is_flag=True,
+    help="List the requirements that apply to the solver; run nothing.",
 )
-@click.option("--out", type=FOLDER, default=Path("lavender-contract"), show_default=True,
-              help="Folder for the problems on which requirements are not met; created for the first one.")  # fmt: skip
+@click.option(
+    "--out",
+    type=FOLDER,
+    default=Path("lavender-contract"),
+    show_default=True,
+    help="Folder for the problems on which requirements are not met; created for the first one.",
+)
 @click.pass_context
 def contract(context: click.Context, name: str, list_only: bool, out: Path) -> None:
     """Check that a solver meets the requirements on every solver.
@@ -116,7 +136,9 @@ def contract(context: click.Context, name: str, list_only: bool, out: Path) -> N
     for check, failure in check_solver(name):
         total += 1
         style = "bold red" if failure.text else ""
-        print_escaped(f"{'NOT MET' if failure.text else 'met    '}  {check.requirement}", style=style)
+        print_escaped(
+            f"{'NOT MET' if failure.text else 'met    '}  {check.requirement}", style=style
+        )
         if failure.text:
             unmet += 1
             print_escaped(f"         {failure.text}")
@@ -125,7 +147,9 @@ def contract(context: click.Context, name: str, list_only: bool, out: Path) -> N
             path = out / f"{check.name}.npz"
             make_problems()[failure.problem].save(path)
             print_escaped(f"         problem: {path}")
-    skipped = [f"{check.name} ({check.applies_to})" for check in CHECKS.values() if not check.applies(spec)]
+    skipped = [
+        f"{check.name} ({check.applies_to})" for check in CHECKS.values() if not check.applies(spec)
+    ]
     print_escaped(f"{name} meets {total - unmet} of {total} requirements")
     if skipped:
         print_escaped("\n    ".join(["not required of this solver, and not tested:", *skipped]))
@@ -168,10 +192,16 @@ def _print_facts(results: dict[str, Any]) -> None:
     missing = [name for name, text in backends.items() if text.startswith("needs ")]
     wrong = {name: result for name, result in self_test.items() if result != "same"}
     shown = {
-        **{key: x for key, x in results.items() if key not in ("self_test", "same_bits", "memory_bytes")},
+        **{
+            key: x
+            for key, x in results.items()
+            if key not in ("self_test", "same_bits", "memory_bytes")
+        },
         "memory": f"{results['memory_bytes'] / 2**30:.1f} GiB",
         "load": "" if results["load"] is None else f"{results['load']:.1f}",
-        "backends": "; ".join(f"{name}: {text}" for name, text in backends.items() if name not in missing),
+        "backends": "; ".join(
+            f"{name}: {text}" for name, text in backends.items() if name not in missing
+        ),
         "not installed": f"{', '.join(missing)} (`lavender solvers NAME` prints the command that installs one)",
         "self-test": f"{len(self_test) - len(wrong)} of {len(self_test)} give their bits",
         **{f"  {name}": result for name, result in wrong.items()},
@@ -180,7 +210,11 @@ def _print_facts(results: dict[str, Any]) -> None:
 
     table = Table.grid(padding=(0, 2))
     for key, value in shown.items():
-        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        text = (
+            ", ".join(f"{k} {v}" for k, v in value.items())
+            if isinstance(value, dict)
+            else str(value)
+        )
         if text:
             table.add_row(key, escape_markup(text))
     make_console().print(table, highlight=False)
@@ -191,7 +225,8 @@ def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
     from lavender import report
     from lavender.diagnostics import diagnose
 
-    diagnostics, errors = {}, ErrorReporter()
+    diagnostics = {}
+    errors = ErrorReporter()
     for item in report.resolve_sources(files):
         with errors(item):
             diagnostics[item.name] = diagnose(item.problem)

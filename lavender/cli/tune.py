@@ -24,12 +24,19 @@ from lavender.io.stored import check_writable
 @click.command()
 @click.argument("model", metavar="MODEL.xml|MODEL.mjb", type=FILE)
 @add_worlds_options(worlds=16, steps=200)
-@click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
+@click.option(
+    "--horizon", default=10, show_default=True, help="Steps after which the motion is compared."
+)
 @click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
 @limit_option
 @threshold_option
-@click.option("--out", type=FOLDER, default=Path("lavender-tune"),
-              show_default=True, help="Folder of the page.")  # fmt: skip
+@click.option(
+    "--out",
+    type=FOLDER,
+    default=Path("lavender-tune"),
+    show_default=True,
+    help="Folder of the page.",
+)
 @quiet_option
 def tune(model: Path, out: Path, quiet: bool, **options: Any) -> None:
     """Find faster or more accurate settings of MuJoCo for a model.
@@ -51,5 +58,7 @@ def tune(model: Path, out: Path, quiet: bool, **options: Any) -> None:
     with show_progress(quiet) as watch:
         tuning = run(model, watch=watch, **options)
     show_page(tuning.page, out, quiet)
-    if tuning.reason_without_line or (tuning.error_limit is not None and tuning.within_limit is None):
+    if tuning.reason_without_line or (
+        tuning.error_limit is not None and tuning.within_limit is None
+    ):
         raise click.exceptions.Exit(EXIT_UNMET)

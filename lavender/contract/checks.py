@@ -14,7 +14,13 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, UnknownName, format_error
-from lavender.contract.problems import EMPTY, INFEASIBLE, change_numbers, make_large_problems, make_problems
+from lavender.contract.problems import (
+    EMPTY,
+    INFEASIBLE,
+    change_numbers,
+    make_large_problems,
+    make_problems,
+)
 from lavender.judge.certificates import check_certificate
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
@@ -23,9 +29,19 @@ from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
 
 # A solver has to count at least one of these kinds of `work`.
-WORK_COUNTERS = {"sweeps", "products", "matvecs", "factorisations", "solves", "pivots", "backend_calls"}
+WORK_COUNTERS = {
+    "sweeps",
+    "products",
+    "matvecs",
+    "factorisations",
+    "solves",
+    "pivots",
+    "backend_calls",
+}
 MIN_BUDGET = 5_000  # Iterations that a resumable solver may use on a problem.
-Requirement = Callable[[SolverSpec, Problem], str]  # Returns the sentence of a failure, or an empty string.
+Requirement = Callable[
+    [SolverSpec, Problem], str
+]  # Returns the sentence of a failure, or an empty string.
 
 
 class ContractError(AssertionError):
@@ -75,15 +91,19 @@ class Check:
     def run(self, spec: SolverSpec) -> None:
         """Raise ContractError if a solver does not meet the requirement on a problem that it accepts."""
         large = make_large_problems().keys()
-        accepted = {name: problem for name, problem in make_problems().items() if not spec.refuses(problem)}
+        accepted = {
+            name: problem for name, problem in make_problems().items() if not spec.refuses(problem)
+        }
         if missing := find_unused_capabilities(spec, list(accepted.values())):
-            raise ContractError(f"the spec lists {', '.join(missing)}, but refuses every problem with it")
+            raise ContractError(
+                f"the spec lists {', '.join(missing)}, but refuses every problem with it"
+            )
         names = {
             "all": [name for name in accepted if name not in large],
             "solvable": [name for name in accepted if name not in {EMPTY, INFEASIBLE, *large}],
             "large": [name for name in accepted if name in large],
             "first": [*accepted][:1],
-        }  # fmt: skip
+        }
         for name in names[self.problems]:
             if failure := self.function(spec, accepted[name]):
                 raise ContractError(f"for {name} (law {accepted[name].law}) {failure}", name)
@@ -97,14 +117,17 @@ def find_unused_capabilities(spec: SolverSpec, accepted: list[Problem]) -> list[
     """Return the capabilities of a spec that none of the accepted problems needs."""
     needed: dict[str, Callable[[Problem], bool]] = {
         **{f"the law {law}": lambda p, law=law: p.law == law for law in spec.laws},  # type: ignore[misc]
-        **{f"boxes under the law {law}": lambda p, law=law: p.law == law and p.cones.has_box  # type: ignore[misc]
-           for law in spec.box_friction_laws},
+        **{
+            f"boxes under the law {law}": lambda p, law=law: p.law == law and p.cones.has_box  # type: ignore[misc]
+            for law in spec.box_friction_laws
+        },
         **{f"the form {form}": lambda p, form=form: p.operator == form for form in spec.operators},  # type: ignore[misc]
-    }  # fmt: skip
+    }
     flags = {
-        "round_cones": lambda p: p.cones.has_round, "supports_rolling": lambda p: p.cones.has_rolling,
+        "round_cones": lambda p: p.cones.has_round,
+        "supports_rolling": lambda p: p.cones.has_rolling,
         "singular_programs": lambda p: p.has_singular_program,
-    }  # fmt: skip
+    }
     needed |= {name: is_needed for name, is_needed in flags.items() if getattr(spec, name)}
     return sorted(name for name, is_needed in needed.items() if not any(map(is_needed, accepted)))
 
@@ -118,7 +141,12 @@ def check(
         name = function.__name__.removeprefix("require_")
         text = (function.__doc__ or "").removeprefix("Require that ")
         CHECKS[name] = Check(
-            name, text[0].upper() + text[1:], applies_to, applies, function=function, problems=problems
+            name,
+            text[0].upper() + text[1:],
+            applies_to,
+            applies,
+            function=function,
+            problems=problems,
         )
         return function
 
@@ -177,17 +205,26 @@ def require_problems_are_solved(spec: SolverSpec, problem: Problem) -> str:
     if silent or solution.solver.name != spec.name:
         return f"{text}. A failure has no message, or the name of the solver is wrong"
     if problem.name == INFEASIBLE:
-        y, named = solution.certificate, "row 1" in solution.message
+        y = solution.certificate
+        named = "row 1" in solution.message
         proven = named and y is not None and check_certificate(problem, y) is None
-        return "" if proven else f"{text}. A certificate and a message that names row 1 are required"
+        return (
+            "" if proven else f"{text}. A certificate and a message that names row 1 are required"
+        )
     if spec.external:  # It may fail if the result reports it.
-        false = solution.status is Status.CONVERGED and not (solution.success or solution.status_conflict)
+        false = solution.status is Status.CONVERGED and not (
+            solution.success or solution.status_conflict
+        )
         return f"{text}. The claim CONVERGED is wrong" if false else ""
     if not solution.success or solution.claim_check != "confirmed":
-        limit = f"lv.residual(problem, impulse).relative <= {solution.tol:g}, a maximum over islands"
+        limit = (
+            f"lv.residual(problem, impulse).relative <= {solution.tol:g}, a maximum over islands"
+        )
         return f"{text}. CONVERGED and {limit} are required; a spec must refuse what its solver cannot solve"
     counted = not problem.m or any(solution.work.get(word, 0) > 0 for word in WORK_COUNTERS)
-    return "" if counted else f"{text}. Its work must count one of {', '.join(sorted(WORK_COUNTERS))}"
+    return (
+        "" if counted else f"{text}. Its work must count one of {', '.join(sorted(WORK_COUNTERS))}"
+    )
 
 
 @check("all solvers", lambda spec: True, problems="large")
@@ -195,8 +232,12 @@ def require_claims_are_true_at_every_tolerance(spec: SolverSpec, problem: Proble
     """Require that larger problems are solved to tolerances from 1e-2 to 1e-10, and every claim is true."""
     for tol in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
         solution = solve_to_tolerance(spec, problem, tol=tol)
-        is_false = solution.status is Status.CONVERGED and not (solution.success or solution.status_conflict)
-        if is_false or (not spec.external and (not solution.success or solution.claim_check != "confirmed")):
+        is_false = solution.status is Status.CONVERGED and not (
+            solution.success or solution.status_conflict
+        )
+        if is_false or (
+            not spec.external and (not solution.success or solution.claim_check != "confirmed")
+        ):
             return f"to tol={tol:g} the result is: {solution}"
     return ""
 
@@ -207,7 +248,13 @@ def require_options_match_the_spec(spec: SolverSpec, problem: Problem) -> str:
     wrong = sorted(set(inspect.signature(spec.load()).parameters) ^ spec.accepts)
     if wrong:
         return f"the options {', '.join(wrong)} are in the spec or in the factory, not in both"
-    options: Any = {"no_such_option": 1, "order": "reverse", "seed": 3, "callback": print, "history": True}
+    options: Any = {
+        "no_such_option": 1,
+        "order": "reverse",
+        "seed": 3,
+        "callback": print,
+        "history": True,
+    }
     for name, value in options.items():
         if not getattr(spec, name, False):
             try:
@@ -244,19 +291,25 @@ def require_bits_are_reproducible(spec: SolverSpec, problem: Problem) -> str:
     """Require that threads, `update` instead of `prepare`, and 1 + 7 + 15 instead of 23 iterations change no bit."""
     options: dict[str, Any] = {"tol": 1e-7, "max_iter": 60 if spec.resumable else None}
     bits = get_bits(solve(problem, spec.name, **options))
-    for other in (replace(problem, b=problem.b * 1.25 + 0.01, qp=problem.qp), change_numbers(problem)):
+    for other in (
+        replace(problem, b=problem.b * 1.25 + 0.01, qp=problem.qp),
+        change_numbers(problem),
+    ):
         if spec.refuses(other):
             continue
         prepared = prepare(other, spec.name)
         prepared.solve(**options)
         if get_bits(prepared.solve(problem, **options)) != bits:
-            return "`update` with another A, b, bounds or coefficients gives other bits than `prepare`"
+            return (
+                "`update` with another A, b, bounds or coefficients gives other bits than `prepare`"
+            )
     with ThreadPoolExecutor(4) as pool:
         if {*pool.map(lambda p: get_bits(solve(p, spec.name, **options)), [problem] * 4)} != {bits}:
             return "the same call gives other bits, from one of four threads"
     ends = set()
     for sizes in ((23,), (1, 7, 15)) if spec.resumable else ():
-        solver, impulse = spec.load()(), problem.start().copy()
+        solver = spec.load()()
+        impulse = problem.start().copy()
         state = solver.prepare(problem.disk)
         for size in sizes:
             solver.run(state, impulse, size, 0.0, None)
@@ -269,7 +322,8 @@ def require_bits_are_reproducible(spec: SolverSpec, problem: Problem) -> str:
 
 
 @check(
-    "solvers with `impulse`, except code of another project", lambda spec: spec.impulse and not spec.external
+    "solvers with `impulse`, except code of another project",
+    lambda spec: spec.impulse and not spec.external,
 )
 def require_a_solution_as_start_is_kept(spec: SolverSpec, problem: Problem) -> str:
     """Require that a solve from a solution ends there at once, and does not modify the array of the start."""
@@ -277,9 +331,15 @@ def require_a_solution_as_start_is_kept(spec: SolverSpec, problem: Problem) -> s
     start = first.impulse.copy()
     again = solve(problem, spec.name, tol=1e-8, impulse=start)
     kept = (
-        again.success and np.array_equal(start, first.impulse) and not (again.iterations and spec.resumable)
+        again.success
+        and np.array_equal(start, first.impulse)
+        and not (again.iterations and spec.resumable)
     )
-    return "" if kept or not first.success else f"a solve from the solution changed it, or ended as: {again}"
+    return (
+        ""
+        if kept or not first.success
+        else f"a solve from the solution changed it, or ended as: {again}"
+    )
 
 
 @check("solvers with `resumable`", lambda spec: spec.resumable, problems="first")
@@ -298,7 +358,11 @@ def require_interruptions_return_the_iterate(spec: SolverSpec, problem: Problem)
 
     if spec.callback:
         ended = solve(problem, spec.name, callback=callback, tol=0.0, max_iter=50)
-        if ended.status is not Status.INTERRUPTED or counts != [0, 1, 2, 3] or np.isnan(ended.impulse).any():
+        if (
+            ended.status is not Status.INTERRUPTED
+            or counts != [0, 1, 2, 3]
+            or np.isnan(ended.impulse).any()
+        ):
             return f"a callback that stops at iteration 3 was called at {counts}; the result is: {ended}"
     if spec.history and not spec.delegates:
         pair = [solve(problem, spec.name, history=x, tol=0.0, max_iter=40) for x in (True, False)]
@@ -312,11 +376,19 @@ def require_interruptions_return_the_iterate(spec: SolverSpec, problem: Problem)
 @check("solvers with `order` or `seed`", lambda spec: spec.order or spec.seed, problems="first")
 def require_orders_change_the_sweep(spec: SolverSpec, problem: Problem) -> str:
     """Require that orders and seeds change the bits of two sweeps, and all of them lead to the solution."""
-    choices: list[dict[str, Any]] = [{"order": order} for order in ("given", "reverse", "random", "colored")]
+    choices: list[dict[str, Any]] = [
+        {"order": order} for order in ("given", "reverse", "random", "colored")
+    ]
     choices += [{"order": "random", "seed": 2}] if spec.seed else []
     for choice in choices:
         if not (found := solve_to_tolerance(spec, problem, **choice)).success:
             return f"with {choice} the result is: {found}"
-    bits = [solve(problem, spec.name, tol=0.0, max_iter=2, **c).impulse.tobytes() for c in choices * 2]
+    bits = [
+        solve(problem, spec.name, tol=0.0, max_iter=2, **c).impulse.tobytes() for c in choices * 2
+    ]
     same = len(set(bits)) == len(choices) and bits[: len(choices)] == bits[len(choices) :]
-    return "" if same else f"two of {choices} give the same bits after 2 sweeps, or one gives two results"
+    return (
+        ""
+        if same
+        else f"two of {choices} give the same bits after 2 sweeps, or one gives two results"
+    )

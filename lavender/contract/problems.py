@@ -53,47 +53,65 @@ def make_contacts(
     b = 6.0 * rng.normal(size=(count, size))
     b[:, 0] = np.where(np.arange(count) % 4 == 3, -1.0, 1.0) * rng.uniform(4.0, 9.0, count)
     mu = np.resize([0.3, 1.7, 0.6, 0.9], count)
-    return Problem.contact(make_matrix(rng, count * size), b.ravel(), mu, friction=friction, **options)
+    return Problem.contact(
+        make_matrix(rng, count * size), b.ravel(), mu, friction=friction, **options
+    )
 
 
 def make_kinds_of_blocks() -> dict[str, Problem]:
     """Return a problem for each kind of block under each law that has it."""
     rng = np.random.default_rng(2)
-    lower, upper = [0.5, -2.0, 0.3, -np.inf, -1.0, 0.4], [np.inf, -0.5, 0.8, 0.2, np.inf, 0.4]
+    lower = [0.5, -2.0, 0.3, -np.inf, -1.0, 0.4]
+    upper = [np.inf, -0.5, 0.8, 0.2, np.inf, 0.4]
     problems = {
-        "bounds that exclude zero": Problem.lcp(make_matrix(rng, 6), 2.0 * rng.normal(size=6), lower, upper),
-    }  # fmt: skip
-    patch, rolling, four = [0.2, 0.5, 0.1, 0.3], [0.1, 0.05, 0.3, 0.1], np.array([0.3, 1.7, 0.6, 0.9])
+        "bounds that exclude zero": Problem.lcp(
+            make_matrix(rng, 6), 2.0 * rng.normal(size=6), lower, upper
+        ),
+    }
+    patch = [0.2, 0.5, 0.1, 0.3]
+    rolling = [0.1, 0.05, 0.3, 0.1]
+    four = np.array([0.3, 1.7, 0.6, 0.9])
     for law in ("coulomb", "cone"):
         kinds = {
             "planar contacts": make_contacts(rng, 2, law, tangents=1),
             "contacts with two tangents": make_contacts(rng, 3, law),
             "contacts that turn": make_contacts(rng, 4, law, patch_radius=patch),
             "contacts that roll": make_contacts(rng, 5, law, rolling=rolling),
-            "contacts that turn and roll": make_contacts(rng, 6, law, patch_radius=patch, rolling=rolling),
+            "contacts that turn and roll": make_contacts(
+                rng, 6, law, patch_radius=patch, rolling=rolling
+            ),
         }
         plain = make_contacts(rng, 3, law)
         shapes = {
-            "contacts with friction boxes": Cones.contacts(np.stack([four, 0.4 * four], 1), shape="box"),
+            "contacts with friction boxes": Cones.contacts(
+                np.stack([four, 0.4 * four], 1), shape="box"
+            ),
             "contacts with friction ellipses": Cones.contacts(np.stack([four, 0.4 * four], 1)),
-            "a contact without friction and a free row": Cones.contacts([0.0, 0.5, 1.2]) + Cones.free(1)
+            "a contact without friction and a free row": Cones.contacts([0.0, 0.5, 1.2])
+            + Cones.free(1)
             + Cones.bounded([-0.1, 0.0], [0.1, np.inf]),
-        }  # fmt: skip
+        }
         kinds |= {name: replace(plain, cones=cones) for name, cones in shapes.items()}
         problems |= {f"{name}, law {law}": problem for name, problem in kinds.items()}
-    jac, mass, cones = rng.normal(size=(20, 12)), make_matrix(rng, 12), Cones.contacts(four, tangents=4)
+    jac = rng.normal(size=(20, 12))
+    mass = make_matrix(rng, 12)
+    cones = Cones.contacts(four, tangents=4)
     problems["round cones of four tangents, law cone"] = Problem.from_jacobian(
         jac, mass, -2.0 * rng.random(12), cones=cones, friction="cone", compliance=np.full(20, 0.3)
     )
     problems["contacts and bounded rows of J and M, law coulomb"] = Problem.from_jacobian(
-        jac[:12], mass, 3.0 * rng.normal(size=12), cones=Cones.bounded(lower, upper) + Cones.contacts([0.5, 1.5]),
+        jac[:12],
+        mass,
+        3.0 * rng.normal(size=12),
+        cones=Cones.bounded(lower, upper) + Cones.contacts([0.5, 1.5]),
         compliance=np.full(12, 0.2),
-    )  # fmt: skip
+    )
     bodies = make_bodies(joints=False, mu=0.5).rows
     assert bodies is not None
     for name, options in (
-        ("turn and roll", {"patch_radius": 0.1, "rolling": 0.05}), ("have friction boxes", {"shape": "box"})
-    ):  # fmt: skip
+        ("turn and roll", {"patch_radius": 0.1, "rolling": 0.05}),
+        ("have friction boxes", {"shape": "box"}),
+    ):
         stack = Problem.from_rows(bodies, 0.0, mu=0.5, compliance=0.3, **options)
         problems[f"contacts of bodies that {name}, law coulomb"] = stack
     sparse = sp.csr_array(
@@ -101,7 +119,12 @@ def make_kinds_of_blocks() -> dict[str, Problem]:
     )
     problems["a sparse A"] = Problem.lcp(sparse, 3.0 * rng.normal(size=12), -1.0, 1.0)
     problems["a singular quadratic program"] = Problem.from_qp(
-        np.diag([1.0, 0.0]), [-1.0, 1.0], np.array([[1.0, 1.0]]), [2.0], lb=[0.0, 0.0], ub=[3.0, 3.0]
+        np.diag([1.0, 0.0]),
+        [-1.0, 1.0],
+        np.array([[1.0, 1.0]]),
+        [2.0],
+        lb=[0.0, 0.0],
+        ub=[3.0, 3.0],
     )
     return problems
 
@@ -109,7 +132,8 @@ def make_kinds_of_blocks() -> dict[str, Problem]:
 def make_large_problems() -> dict[str, Problem]:
     """Return a larger problem of each law, for claims at several tolerances."""
     rng = np.random.default_rng(3)
-    a, b = make_matrix(rng, LARGE_ROWS), rng.normal(size=LARGE_ROWS)
+    a = make_matrix(rng, LARGE_ROWS)
+    b = rng.normal(size=LARGE_ROWS)
     return {
         f"{LARGE_ROWS} free rows": Problem.linear(a, b),
         f"{LARGE_ROWS} bounded rows": Problem.lcp(
@@ -126,9 +150,13 @@ def change_numbers(problem: Problem) -> Problem:
     scale = 1.0 + 0.3 * np.sin(np.arange(1.0, m + 1.0))
     is_ratio = cones.is_box | (cones.has_ellipse & (cones.spin_rows < 0))
     cones = replace(
-        cones, lower=1.5 * cones.lower, upper=1.5 * cones.upper, mu=0.7 * cones.mu, rolling=0.7 * cones.rolling,
+        cones,
+        lower=1.5 * cones.lower,
+        upper=1.5 * cones.upper,
+        mu=0.7 * cones.mu,
+        rolling=0.7 * cones.rolling,
         patch_radius=np.where(is_ratio, 1.0, 0.7) * cones.patch_radius,
-    )  # fmt: skip
+    )
     more: dict[str, Any] = {"cones": cones, "b": 1.25 * problem.b + 0.01 * (problem.m > 0)}
     if problem.generalized is not None:
         general = problem.generalized
@@ -154,15 +182,22 @@ def make_problems() -> dict[str, Problem]:
     roots = (rng.normal(size=(m, m + 2)) for m in (6, 9))
     six, nine = (g @ g.T / len(g) + 0.5 * np.eye(len(g)) for g in roots)  # definite
     islands = np.zeros((12, 12))
-    islands[:6, :6], islands[6:, 6:] = six, 2.0 * np.eye(6)  # Sweeps solve the second one at once.
-    skew, b = np.triu(rng.normal(size=(6, 6)), 1), rng.normal(size=6)
+    islands[:6, :6] = six
+    islands[6:, 6:] = 2.0 * np.eye(6)  # Sweeps solve the second one at once.
+    skew = np.triu(rng.normal(size=(6, 6)), 1)
+    b = rng.normal(size=6)
     # Eigenvalues near 4 (1 +- 0.9 i): the error of Gauss-Seidel shrinks by 0.81; solvers for a symmetric A fail.
     turning = 4.0 * np.kron(np.eye(3), [[1.0, 0.9], [-0.9, 1.0]]) + 0.1 * (skew - 0.5 * skew.T)
     ends = np.array([1.0, -1.0, 0.0, 0.0, 1.0, -1.0])  # N s: four rows end at a bound.
     robot = Problem.from_jacobian(
-        rng.normal(size=(11, 9)), nine, rng.normal(size=9), target=rng.normal(size=11), compliance=np.full(11, 0.2),
-        cones=Cones.bounded([0.0, -0.2], [np.inf, 0.2]) + Cones.contacts([0.2, 0.5, 0.9]), friction="cone",
-    )  # fmt: skip
+        rng.normal(size=(11, 9)),
+        nine,
+        rng.normal(size=9),
+        target=rng.normal(size=11),
+        compliance=np.full(11, 0.2),
+        cones=Cones.bounded([0.0, -0.2], [np.inf, 0.2]) + Cones.contacts([0.2, 0.5, 0.9]),
+        friction="cone",
+    )
     return {
         "free rows of a chain of bodies": make_bodies(joints=True),
         "a stack of boxes without friction": make_bodies(joints=False),
@@ -172,7 +207,9 @@ def make_problems() -> dict[str, Problem]:
         "two islands whose b differ by 1e6": Problem.lcp(islands, np.concatenate([b, 1e6 * b])),
         "a diagonal A": Problem.lcp(np.diag([1.0, 2.0, 4.0]), [1.0, -1.0, 3.0]),
         "an asymmetric A": Problem.lcp(turning, 4.0 * b, -0.5, 2.0),
-        "contacts in a matrix, law coulomb": Problem.contact(nine, rng.normal(size=9), [0.3, 0.6, 1.2]),
+        "contacts in a matrix, law coulomb": Problem.contact(
+            nine, rng.normal(size=9), [0.3, 0.6, 1.2]
+        ),
         "a stack of boxes, law coulomb": make_bodies(joints=False, mu=0.5),
         "a stack of boxes, law cone": make_bodies(joints=False, friction="cone", mu=0.5),
         "J and M of a robot, law cone": robot,

@@ -30,14 +30,23 @@ from lavender.problem import Problem, check_problem
 __all__ = ["Diagnostic", "diagnose"]
 
 CHECKS = (
-    blocks.diagnose_blocks, blocks.diagnose_row_order, blocks.diagnose_duplicate_contacts,
-    motion.diagnose_targets, bodies.diagnose_geometry, bodies.diagnose_masses,
+    blocks.diagnose_blocks,
+    blocks.diagnose_row_order,
+    blocks.diagnose_duplicate_contacts,
+    motion.diagnose_targets,
+    bodies.diagnose_geometry,
+    bodies.diagnose_masses,
     blocks.diagnose_conflict,
-)  # fmt: skip
+)
 
 
 def diagnose(
-    problem: Problem, impulse: Any = None, *, velocity: Any = None, gap: Any = None, dt: float | None = None
+    problem: Problem,
+    impulse: Any = None,
+    *,
+    velocity: Any = None,
+    gap: Any = None,
+    dt: float | None = None,
 ) -> tuple[Diagnostic, ...]:
     """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
@@ -86,7 +95,9 @@ def diagnose(
         solution = problem.guess if impulse is None else problem.make_start(impulse)
         cached = problem.derived.cache.get(__name__)
         if cached is None:
-            cached = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))
+            cached = problem.derived.cache[__name__] = tuple(
+                s for check in CHECKS for s in check(problem)
+            )
         diagnostics = [*(replace(s, data=dict(s.data)) for s in cached), *of_state]
         if solution is not None:
             diagnostics += blocks.diagnose_impulses(problem, solution)

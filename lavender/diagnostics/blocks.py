@@ -22,7 +22,9 @@ MAX_MOMENTUM_RATIO = 1e4
 # [rows] For larger problems, no proof that no solution exists is searched: it takes seconds.
 MAX_CONFLICT_ROWS = 1000
 TIME_STEPS = tuple(0.02 * 0.8**k for k in range(34))  # [s] 20 ms to 13 us
-CONFLICT_TOL = 1e-6  # [-] A proof counts only if it excludes every answer with up to this relative residual.
+CONFLICT_TOL = (
+    1e-6  # [-] A proof counts only if it excludes every answer with up to this relative residual.
+)
 
 
 def diagnose_blocks(p: Problem) -> Iterator[Diagnostic]:
@@ -41,7 +43,9 @@ def diagnose_blocks(p: Problem) -> Iterator[Diagnostic]:
             blocks = np.flatnonzero(np.isin(p.key, values[count > 1]))
             yield make_diagnostic(p, "duplicate keys", reason, blocks)
     rows = np.setdiff1d(p.metric.empty, np.flatnonzero(p.cones.friction_rows))
-    rows = rows[p.cones.contact_rows[rows] | (np.abs(p.b[rows]) > 2.0**-51 * np.abs(p.b).max(initial=0.0))]
+    rows = rows[
+        p.cones.contact_rows[rows] | (np.abs(p.b[rows]) > 2.0**-51 * np.abs(p.b).max(initial=0.0))
+    ]
     if len(rows):
         reason = "no impulse changes their velocity, as between immovable bodies: remove them, or give a body a mass"
         yield make_diagnostic(p, "immovable", reason, [p.block_of(int(i)) for i in rows])
@@ -53,20 +57,26 @@ def diagnose_row_order(p: Problem) -> Iterator[Diagnostic]:
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
-    k, i = len(full), np.arange(len(full))[:, None]
+    k = len(full)
+    i = np.arange(len(full))[:, None]
     all_full = 3 * k == np.count_nonzero(c.contact_rows)
     if p.generalized is not None and all_full and reconstruct_bodies(p) is None:
         # After the normals, the tangents come contact by contact, or all first tangents before all second ones.
         orders = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
-        if any(reconstruct_bodies_from_rows(p, c.ptr[full[0]] + order) is not None for order in orders):
-            reason = "J has the rows of rigid bodies if all normals come first; the order is contact by "
+        if any(
+            reconstruct_bodies_from_rows(p, c.ptr[full[0]] + order) is not None for order in orders
+        ):
+            reason = (
+                "J has the rows of rigid bodies if all normals come first; the order is contact by "
+            )
             reason += "contact: normal, tangent, tangent, then the next contact"
             yield make_diagnostic(p, "all normals first", reason, full)
             return
     # For a matrix, only b can be checked. On a normal row, b is an approach velocity from gravity, bounce or
     # penetration.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
-    whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
+    whole = np.abs(b).sum(axis=0)
+    toward = b.sum(axis=0)
     row = int(whole.argmax())
     is_alone = toward[row] > 0.98 * whole[row] and whole[row] > 0.8 * whole.sum()
     if row and is_alone and toward[0] < 0.1 * whole[0] + 1e-9 * whole.sum():
@@ -88,7 +98,9 @@ def _moves_without_turning(p: Problem, i: int, a: Any) -> bool:
         alike = np.abs(block - block[0, 0] * np.eye(end - j)) <= 1e-9 * block[0, 0]
         return end - j >= 3 and bool(alike.all())
     squares = (block[:, block.any(axis=0)] ** 2).sum(axis=0)
-    return len(squares) <= min(end - j, 3) or (end - j >= 3 and bool(np.all(np.abs(squares - 1.0) <= 1e-9)))
+    return len(squares) <= min(end - j, 3) or (
+        end - j >= 3 and bool(np.all(np.abs(squares - 1.0) <= 1e-9))
+    )
 
 
 def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
@@ -101,15 +113,21 @@ def diagnose_duplicate_contacts(p: Problem) -> Iterator[Diagnostic]:
     seen: dict[bytes, int] = {}
     again, opposed = [], []
     for i in contacts.tolist():
-        j, end = c.ptr[i], c.ptr[i + 1]
+        j = c.ptr[i]
+        end = c.ptr[i + 1]
         part = slice(a.indptr[j], a.indptr[end])
-        index, x = a.indices[part].tobytes() + np.diff(a.indptr[j : end + 1]).tobytes(), a.data[part]
+        index = a.indices[part].tobytes() + np.diff(a.indptr[j : end + 1]).tobytes()
+        x = a.data[part]
         if len(x) and seen.setdefault(index + x.tobytes(), i) != i:
             again.append(i)
         row = slice(a.indptr[j], a.indptr[j + 1])
         other = seen.get(b"-" + a.indices[row].tobytes() + (0.0 - a.data[row]).tobytes())
         seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
-        if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
+        if (
+            other is not None
+            and len(a.data[row])
+            and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max()
+        ):
             opposed += [other, i]
     again = [i for i in again if not _moves_without_turning(p, i, a)]
     # Fewer duplicates are normal: collision detection repeats points.
@@ -133,11 +151,15 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
     # Forces are impulses divided by dt: with some dt they solve the problem better than zero. A true start can have
     # a large error, too: of a heavy body on a light one.
     if r.relative > 50.0 and any(residual(p, dt * impulse).relative < 0.5 for dt in TIME_STEPS):
-        reason = f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N]?"
+        reason = (
+            f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N]?"
+        )
         yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
     if p.rows is not None:
-        mass = np.divide(1.0, p.rows.inv_mass, out=np.zeros(p.rows.n_bodies), where=p.rows.inv_mass > 0.0)
+        mass = np.divide(
+            1.0, p.rows.inv_mass, out=np.zeros(p.rows.n_bodies), where=p.rows.inv_mass > 0.0
+        )
         turn = np.diagonal(np.linalg.pinv(p.rows.inv_inertia, hermitian=True), axis1=1, axis2=2)
         masses = np.column_stack([mass, mass, mass, turn]).ravel()
     elif p.generalized is not None:
@@ -153,7 +175,9 @@ def diagnose_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
             f"the impulse of {p.row_name(i)}, {impulse[i]:.3g} N s, pushes with {push[i]:.3g} N s, but the momentum "
             f"of the problem is {momentum:.3g} N s: is its row of J nearly zero, or nearly equal to another?"
         )
-        yield make_diagnostic(p, "impulses", reason, [p.block_of(i)], push=float(push[i]), momentum=momentum)
+        yield make_diagnostic(
+            p, "impulses", reason, [p.block_of(i)], push=float(push[i]), momentum=momentum
+        )
 
 
 def diagnose_conflict(p: Problem) -> Iterator[Diagnostic]:

@@ -12,7 +12,9 @@ from lavender.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-MAX_DENSE_VELOCITIES = 600  # M of up to this many velocities is converted to a dense matrix and inverted.
+MAX_DENSE_VELOCITIES = (
+    600  # M of up to this many velocities is converted to a dense matrix and inverted.
+)
 MISTAKEN_READINGS = (  # Possible mistakes in problems of bodies, and in problems of J and M.
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
     ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
@@ -26,20 +28,30 @@ def reconstruct_bodies(p: Problem) -> Rows | None:
     return p.derived.cache[__name__]
 
 
-def reconstruct_bodies_from_rows(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+def reconstruct_bodies_from_rows(
+    p: Problem, rows: npt.NDArray[np.intp] | None = None
+) -> Rows | None:
     """Compute the result of `reconstruct_bodies`.
 
     `rows` (c, 3) holds the rows of J of each contact; the default is the rows of the problem's cones.
     """
     g, c = p.generalized, p.cones
     contact = c.is_contact
-    if g is None or g.nv > MAX_DENSE_VELOCITIES or not contact.any() or np.any(c.n_tangents[contact] != 2):
+    if (
+        g is None
+        or g.nv > MAX_DENSE_VELOCITIES
+        or not contact.any()
+        or np.any(c.n_tangents[contact] != 2)
+    ):
         return p.rows
     if rows is None:
         rows = c.ptr[:-1][contact][:, None] + np.arange(3)
-    mass, part = g.mass.toarray(), g.jac.toarray()[rows]
+    mass = g.mass.toarray()
+    part = g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
-    for j in find_free_bodies(mass):  # Three equal entries of M may also be the rotational inertia of a ball.
+    for j in find_free_bodies(
+        mass
+    ):  # Three equal entries of M may also be the rotational inertia of a ball.
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
             six.append(np.arange(j, j + 6))
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
@@ -61,10 +73,15 @@ def reconstruct_bodies_from_rows(p: Problem, rows: npt.NDArray[np.intp] | None =
         return None
     arm = np.stack([moment[..., 1, 2], moment[..., 2, 0], moment[..., 0, 1]], axis=-1)
     return Rows(
-        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.linalg.inv(mass[at[:, 3:, None], at[:, None, 3:]]),
-        v_free=g.v_free[at], normal=axes[:, 0], tangent=axes[:, 1], arm_a=arm[first, k], arm_b=arm[last, k],
+        inv_mass=1.0 / mass[at[:, 0], at[:, 0]],
+        inv_inertia=np.linalg.inv(mass[at[:, 3:, None], at[:, None, 3:]]),
+        v_free=g.v_free[at],
+        normal=axes[:, 0],
+        tangent=axes[:, 1],
+        arm_a=arm[first, k],
+        arm_b=arm[last, k],
         contact_body=np.stack([np.where(count == 2, first, -1), len(six) + last], axis=1),
-    )  # fmt: skip
+    )
 
 
 def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
@@ -91,7 +108,9 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
         reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
         yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
-    if p.rows is not None:  # With J and M, `blocks.diagnose_duplicate_contacts` compares the rows of J.
+    if (
+        p.rows is not None
+    ):  # With J and M, `blocks.diagnose_duplicate_contacts` compares the rows of J.
         yield from _diagnose_coincident_contacts(p, p.rows, size)
 
 
@@ -103,9 +122,12 @@ def _diagnose_coincident_contacts(p: Problem, r: Rows, size: FloatArray) -> Iter
     arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
     n = sign * r.normal
     order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
-    equal, opposed, blocks = [], [], np.flatnonzero(p.cones.is_contact)
+    equal = []
+    opposed = []
+    blocks = np.flatnonzero(p.cones.is_contact)
     for step in (1, 2, 3):
-        i, j = order[:-step], order[step:]
+        i = order[:-step]
+        j = order[step:]
         near = np.linalg.norm(arm[i] - arm[j], axis=1)
         same = np.all(pair[i] == pair[j], axis=1)
         dot = np.einsum("ij,ij->i", n[i], n[j])
@@ -128,17 +150,23 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
         return
     eigen = np.linalg.eigvalsh(r.inv_inertia)
     # Compute the longest arm of each body over contacts and joint rows with a linear part.
-    size, joint = np.zeros(r.n_bodies), np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
+    size = np.zeros(r.n_bodies)
+    joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
     for side in (0, 1):
-        body, arm = r.contact_body[:, side], np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
+        body = r.contact_body[:, side]
+        arm = np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
         np.maximum.at(size, body[body >= 0], arm[body >= 0])
-        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
+        push, turn = (
+            np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3)
+        )
         has = (joint[:, side] >= 0) & (push > 0.0)
         np.maximum.at(size, joint[has, side], turn[has] / push[has])
     known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
     if not len(known):
         return
-    m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
+    m = r.inv_mass[known]
+    e = eigen[known]
+    s2 = size[known] ** 2
     given = MISTAKEN_READINGS[p.generalized is not None]
     # Left side of (2) with mass and inertia as given, and with one or both replaced by the inverse.
     readings = {
@@ -152,7 +180,9 @@ def diagnose_masses(p: Problem) -> Iterator[Diagnostic]:
     best = min(share, key=lambda name: abs(share[name] + 0.4))
     if abs(own + 0.4) > 1.6 and abs(share[best] + 0.4) < 0.5:
         ratio = 10 ** (0.5 * own)
-        reason = f"radii of gyration are {ratio:.2g} times the arms of contacts and joints; ordinary "
+        reason = (
+            f"radii of gyration are {ratio:.2g} times the arms of contacts and joints; ordinary "
+        )
         reason += f"({10 ** (0.5 * share[best]):.2g}) if {best} was given"
         yield make_diagnostic(p, "masses", reason, ratio=ratio)
         return

@@ -35,7 +35,9 @@ class Diagnostic:
     data: dict[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        names = ", ".join(self.names[:3]) + (f", {len(self.names) - 3} more" if len(self.names) > 3 else "")
+        names = ", ".join(self.names[:3]) + (
+            f", {len(self.names) - 3} more" if len(self.names) > 3 else ""
+        )
         return f"{self.kind}: {self.reason}" + (f" ({names})" if names else "")
 
     def __repr__(self) -> str:
@@ -43,7 +45,9 @@ class Diagnostic:
         return f"<{type(self).__name__} {self}>"
 
 
-def make_diagnostic(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Diagnostic:
+def make_diagnostic(
+    problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any
+) -> Diagnostic:
     """Build a diagnostic with the names of the first 100 of these blocks; no block means the whole problem."""
     at = tuple(int(i) for i in np.unique(np.asarray(blocks, int)))
     names = tuple(problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in at[:100])

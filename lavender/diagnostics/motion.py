@@ -41,9 +41,11 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     motion = get_targets_and_velocity(p)
     if motion is None:
         return
-    target, c = motion[0], p.cones
+    target = motion[0]
+    c = p.cones
     if p.rows is not None and p.compliance is not None:
-        jac, own = p.rows.jac, slice(len(p.rows.jac))
+        jac = p.rows.jac
+        own = slice(len(p.rows.jac))
         is_linear = np.any(jac[:, 0:3] != 0.0, axis=1) | np.any(jac[:, 6:9] != 0.0, axis=1)
         is_rigid = (c.lower[own] == -np.inf) & (c.upper[own] == np.inf) & (p.compliance[own] == 0.0)
         rows = np.flatnonzero(is_linear & is_rigid & (np.abs(target[own]) > MAX_SEPARATION_TARGET))
@@ -57,9 +59,7 @@ def diagnose_targets(p: Problem) -> Iterator[Diagnostic]:
     joints = int(np.count_nonzero(~c.contact_rows))
     if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
         largest = np.abs(target[tangent]).max()
-        reason = (
-            f"tangents have targets up to {largest:.3g} m/s, and none if the {joints} targets of joints come "
-        )
+        reason = f"tangents have targets up to {largest:.3g} m/s, and none if the {joints} targets of joints come "
         reason += "first, in the order of the rows"
         yield make_diagnostic(p, "targets", reason)
         return
@@ -101,27 +101,37 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float | None) -> Ite
         velocity = as_array("velocity", velocity, shape, unit="m/s")
     if gap is not None:
         if dt is None:
-            raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
+            raise InputError(
+                "gap [m] is compared with targets [m/s] by the step size: give dt [s], too"
+            )
         gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
     contact = np.flatnonzero(p.cones.is_contact)
     if not len(contact):
         return
-    normal, g, r = p.cones.normal_rows, p.generalized, p.rows
+    normal = p.cones.normal_rows
+    g = p.generalized
+    r = p.rows
     if velocity is not None:
         step = (v_free - velocity).ravel()
         change = np.abs((p.jacobian @ step)[normal])
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= MAX_DENSE_VELOCITIES:
-            push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(-1, 3)
+            push = np.array([step[j : j + 3] for j in find_free_bodies(g.mass.toarray())]).reshape(
+                -1, 3
+            )
         # Use free bodies only, if there are any: light links of a robot have larger accelerations than gravity.
         fall = np.linalg.norm(push, axis=1) if len(push) else change
         fall = fall[fall > 0.01 * fall.max()]  # Ignore bodies on which no force acts.
         typical = float(np.median(fall)) if len(fall) else 0.0
         if not step.any():
-            reason = "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)"
+            reason = (
+                "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)"
+            )
             yield make_diagnostic(p, "v_free", reason)
         elif typical > 0.5 * G:
-            reason = f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
+            reason = (
+                f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
+            )
             yield make_diagnostic(p, "v_free", reason, change=typical)
     if gap is None or dt is None:
         return
@@ -143,5 +153,9 @@ def diagnose_state(p: Problem, velocity: Any, gap: Any, dt: float | None) -> Ite
     share = float(np.median(np.abs(target[comparable] / gap[comparable]))) * dt
     if not 1.5 * dt <= share <= 0.1 / dt:
         reason = f"targets are {share:.2g} times gap/dt in the median; 1 is expected: "
-        reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
+        reason += (
+            "are they divided by dt twice?"
+            if share > 1.0
+            else "are they multiplied by dt once more?"
+        )
         yield make_diagnostic(p, "targets", reason, contact[comparable], share=share)

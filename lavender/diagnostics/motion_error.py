@@ -135,9 +135,13 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     check_problem(problem)
     x = problem.make_start(impulse)
     if reference is None and problem.law == "coulomb":
-        reference = raise_if_interrupted(solve(problem, impulse=x, tol=COULOMB_REFERENCE_TOL)).impulse
+        reference = raise_if_interrupted(
+            solve(problem, impulse=x, tol=COULOMB_REFERENCE_TOL)
+        ).impulse
     elif reference is None and (reference := problem.derived.cache.get(__name__)) is None:
-        best = raise_if_interrupted(solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)).impulse
+        best = raise_if_interrupted(
+            solve(problem, impulse=problem.start(), tol=REFERENCE_TOL)
+        ).impulse
         reference = problem.derived.cache.setdefault(__name__, best)
     reference = mark_read_only(np.array(problem.make_start(reference, "reference")))
     # Numbers that are not finite are None; `note` names them.
@@ -148,7 +152,9 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> MotionError:
     """Compute the distance of an impulse x (m,) [N s] from a reference (m,) [N s]."""
     judged = measure_residual(problem, reference, "float64")
-    values: dict[str, Any] = dict.fromkeys(("kinetic", "energy", "relative", "speed", "spin", "rows"))
+    values: dict[str, Any] = dict.fromkeys(
+        ("kinetic", "energy", "relative", "speed", "spin", "rows")
+    )
     values |= {"body": -1, "spin_body": -1, "row": -1}
     notes = []
     if not (judged.relative <= REFERENCE_MAX_RESIDUAL or judged.at_floor):
@@ -166,8 +172,12 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
             values["body"], values["speed"] = _find_index_and_max(np.abs(velocity))
         elif velocity is not None:
             bodies = velocity.reshape(-1, 6)
-            values["body"], values["speed"] = _find_index_and_max(np.linalg.norm(bodies[:, :3], axis=1))
-            values["spin_body"], values["spin"] = _find_index_and_max(np.linalg.norm(bodies[:, 3:], axis=1))
+            values["body"], values["speed"] = _find_index_and_max(
+                np.linalg.norm(bodies[:, :3], axis=1)
+            )
+            values["spin_body"], values["spin"] = _find_index_and_max(
+                np.linalg.norm(bodies[:, 3:], axis=1)
+            )
         if not problem.is_semidefinite:
             asymmetry = f"not symmetric (by {problem.asymmetry:.1e})"
             reason = "not positive semidefinite" if problem.is_symmetric else asymmetry
@@ -180,12 +190,18 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
             if values["relative"] == math.inf and math.isfinite(size):
                 notes.append("no relative error, because the constraints cause almost no motion")
                 values["relative"] = None
-    missing = [name for name, value in values.items() if value is not None and not math.isfinite(value)]
+    missing = [
+        name for name, value in values.items() if value is not None and not math.isfinite(value)
+    ]
     if missing:
         notes.append(f"beyond float64: {', '.join(missing)}")
         values |= dict.fromkeys(missing)
     return MotionError(
-        **values, reference=reference, reference_residual=judged, note="; ".join(notes), _problem=problem
+        **values,
+        reference=reference,
+        reference_residual=judged,
+        note="; ".join(notes),
+        _problem=problem,
     )
 
 

@@ -22,7 +22,9 @@ from lavender.problem import Problem, check_problem
 from lavender.problem.ordering import group_blocks_by_island
 from lavender.solvers.islands import find_islands, get_rows_of_blocks
 
-MIN_NEW_PART = 1e-6  # Smallest new part of a direction that differs from rounding of A, or of float32 data.
+MIN_NEW_PART = (
+    1e-6  # Smallest new part of a direction that differs from rounding of A, or of float32 data.
+)
 MAX_BASIS_NUMBERS = (
     2**27
 )  # Largest number of entries of the orthonormal rows of an island and their coefficients.
@@ -66,7 +68,8 @@ class Redundancy:
     @property
     def block_names(self) -> tuple[str, ...]:
         """Names of the blocks (joints, contacts) with only redundant rows: removing them changes no motion."""
-        p, size = self.problem, np.diff(self.problem.cones.ptr)
+        p = self.problem
+        size = np.diff(self.problem.cones.ptr)
         count = np.bincount([p.block_of(i) for i in self.rows], minlength=p.n_blocks)
         return tuple(p.block_name(int(i)) for i in np.flatnonzero((count > 0) & (count == size)))
 
@@ -108,10 +111,13 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     tol = check_float("tol", tol, low=0.0, high=1.0)
     jacobian: Any = None
     if problem.matrix is None and not np.any(problem.compliance):
-        jacobian = problem.generalized.jac if problem.generalized else problem.velocity_form().jacobian
+        jacobian = (
+            problem.generalized.jac if problem.generalized else problem.velocity_form().jacobian
+        )
     tol = max(tol, MIN_NEW_PART) if jacobian is None or problem.precision == "float32" else tol
     m = problem.m
-    unique, dependent = np.ones(m, bool), []
+    unique = np.ones(m, bool)
+    dependent = []
     for blocks in group_blocks_by_island(*find_islands(problem)):
         island = get_rows_of_blocks(problem, blocks)
         part = sp.csr_array((problem.csr[:, island] if jacobian is None else jacobian)[island])
@@ -158,7 +164,9 @@ def _has_full_rank(rows: sp.csr_array, is_delassus: bool, tol: float) -> bool:
     return bool(max(MIN_INVERSE_NORM, 1e3 * tol**2) * onenormest(inverse) < 1.0)
 
 
-def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+def _decompose_rows(
+    rows: sp.csr_array, tol: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Return whether each of m rows of length 1 is in a largest independent set, and whether a null vector moves it.
 
     Gram-Schmidt is applied twice to chunks of rows. Earlier rows are preferred among those with similar new parts. The
@@ -167,18 +175,24 @@ def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool
     from scipy.linalg import solve_triangular
 
     m, n = rows.shape
-    size, r = min(m, n), 0
+    size = min(m, n)
+    r = 0
     if size * (n + size) > MAX_BASIS_NUMBERS:
-        raise CapabilityError(f"{m} rows over {n} velocities are coupled; their rank takes too much memory")
+        raise CapabilityError(
+            f"{m} rows over {n} velocities are coupled; their rank takes too much memory"
+        )
     tol = max(tol, m * 2.0**-53)  # Rounding leaves about m 2^-53.
     basis, lower = np.zeros((size, n)), np.zeros((size, size))  # independent rows = lower basis
-    y, dependent_sum = np.random.default_rng(0).normal(size=(2, m)), np.zeros((2, size))
+    y = np.random.default_rng(0).normal(size=(2, m))
+    dependent_sum = np.zeros((2, size))
     is_new = np.zeros(m, bool)
     pending = np.arange(m)
     for min_part in MIN_PARTS:
         deferred: list[int] = []
         for at in np.split(pending, range(CHUNK_ROWS, len(pending), CHUNK_ROWS)):
-            chunk, start, coefficients = rows[at].toarray(), r, np.zeros((len(at), size))
+            chunk = rows[at].toarray()
+            start = r
+            coefficients = np.zeros((len(at), size))
             for _ in range(2):
                 step = chunk @ basis[:start].T
                 chunk -= step @ basis[:start]
@@ -200,6 +214,8 @@ def _decompose_rows(rows: sp.csr_array, tol: float) -> tuple[npt.NDArray[np.bool
                     deferred.append(i)
         pending = np.array(deferred, int)
     if r:
-        y[:, is_new] = -solve_triangular(lower[:r, :r], dependent_sum[:, :r].T, lower=True, trans=1).T
+        y[:, is_new] = -solve_triangular(
+            lower[:r, :r], dependent_sum[:, :r].T, lower=True, trans=1
+        ).T
     largest = np.abs(y).max(axis=0)
     return is_new, largest > NULL_VECTOR_TOL * largest.max(initial=0.0)

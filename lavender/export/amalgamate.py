@@ -16,11 +16,32 @@ EXTRACT_C: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "ex
 ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
 #: Modules of lavender_ext with functions that the library uses.
 MODULES = (
-    "core.assemble", "core.blocks", "core.checks", "core.generalized", "core.order", "core.problem", "judge.measure",
-    "judge.stopping_test", "sweep.packed", "sweep.pgs", "sweep.serial", "local.gauss_seidel", "accelerate.accelerated",
-    "accelerate.admm", "driver.driver", "newton.solve", "pivot.direct", "pivot.lemke", "pivot.principal",
-    "factor.graph", "factor.linear", "factor.symbolic", "engine.arrays", "engine.substep", "driver.memory",
-)  # fmt: skip
+    "core.assemble",
+    "core.blocks",
+    "core.checks",
+    "core.generalized",
+    "core.order",
+    "core.problem",
+    "judge.measure",
+    "judge.stopping_test",
+    "sweep.packed",
+    "sweep.pgs",
+    "sweep.serial",
+    "local.gauss_seidel",
+    "accelerate.accelerated",
+    "accelerate.admm",
+    "driver.driver",
+    "newton.solve",
+    "pivot.direct",
+    "pivot.lemke",
+    "pivot.principal",
+    "factor.graph",
+    "factor.linear",
+    "factor.symbolic",
+    "engine.arrays",
+    "engine.substep",
+    "driver.memory",
+)
 HEADER = HERE / "c" / "lavender.h"
 FRONT = [
     HERE / "capi" / f"{name}.c"
@@ -38,7 +59,10 @@ def generate_name_functions(header: str) -> str:
     errors, methods, outcomes = re.findall(r"enum \{ /\*[^*]*\*/\n(.*?)\n\};", header, re.DOTALL)
     texts = re.findall(r"(LAV_\w+) = -?\d+,?\s*/\* (.*?) \*/", errors)
     lists = {"lav_text(int32_t code)": (texts, '"no such code"')}
-    for call, body in (("lav_name(int32_t method)", methods), ("lav_outcome(int32_t outcome)", outcomes)):
+    for call, body in (
+        ("lav_name(int32_t method)", methods),
+        ("lav_outcome(int32_t outcome)", outcomes),
+    ):
         names = re.findall(r"(LAV_\w+) = ", body)
         lists[call] = ([(name, name.removeprefix("LAV_").lower()) for name in names], "NULL")
     out = []

@@ -27,7 +27,8 @@ def engine_image(simulation: Simulation) -> bytes:
     index = state.index.astype("<i4").tobytes()
     body = state.size.astype("<i4").tobytes() + state.real.astype("<f8").tobytes()
     body += index + bytes(-len(index) % 8) + state.keys.astype("<u8").tobytes()
-    h, full = 0, 2**64 - 1
+    h = 0
+    full = 2**64 - 1
     for word in np.frombuffer(body, "<u8").tolist():
         h = ((h ^ word) * 0x9E3779B97F4A7C15) & full
         h ^= h >> 29

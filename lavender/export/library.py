@@ -74,13 +74,16 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
     }
     contents["lavender.c"] = source()
     sums = "".join(
-        f"{hashlib.sha256(contents[name].encode()).hexdigest()}  {name}\n" for name in sorted(contents)
+        f"{hashlib.sha256(contents[name].encode()).hexdigest()}  {name}\n"
+        for name in sorted(contents)
     )
     contents["SHA256SUMS"] = sums
     files = {out / name: text.encode() for name, text in contents.items()}
     for path, data in files.items():
         if path.exists() and not replace and path.read_bytes() != data:
-            raise InputError(f"{path} exists with other contents: give --replace, or another folder")
+            raise InputError(
+                f"{path} exists with other contents: give --replace, or another folder"
+            )
     for path, data in files.items():
         make_folder(path.parent)
         write_bytes(path, data)

@@ -20,7 +20,8 @@ from lavender.judge.solution import Status
 
 # A backend with `prefers_dense` gets dense matrices of up to this many entries, or of MAX_DENSE_FILL times the number
 # of their nonzero entries.
-MAX_DENSE_ENTRIES, MAX_DENSE_FILL = 10**4, 4
+MAX_DENSE_ENTRIES = 10**4
+MAX_DENSE_FILL = 4
 # A backend that replaces the handler of Ctrl-C puts the previous one back. Two of them at the same time would leave the
 # handler of one, with which Ctrl-C no longer raises KeyboardInterrupt.
 _HANDLER_LOCK = threading.Lock()
@@ -51,7 +52,9 @@ class Backend:
     row_iterations: float = 1e9
     interior: bool = False  # Whether the backend is an interior-point method.
     dense: bool = False  # Whether the backend accepts dense matrices only.
-    prefers_dense: bool = False  # Whether the backend gets dense matrices if they are small or full.
+    prefers_dense: bool = (
+        False  # Whether the backend gets dense matrices if they are small or full.
+    )
     starts: bool = False  # Whether a start point is passed to the backend.
     stoppable: bool = False  # Whether the backend accepts a time limit.
     # Whether the backend reads its time limit rarely: 20 ms took daqp 2 s on 400 contacts.
@@ -95,12 +98,17 @@ def _call_through_qpsolvers(
     import qpsolvers
 
     limits = {**vars(limit), "eps": max(limit.eps, backend.min_tolerance)}
-    options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
-    settings = {name: x for name, x in options.items() if x is not None}  # Leave out a time limit of None.
+    options = {
+        name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()
+    }
+    settings = {
+        name: x for name, x in options.items() if x is not None
+    }  # Leave out a time limit of None.
     n = program.n
     dense = backend.dense
     if backend.prefers_dense:
-        size, nonzeros = n * (n + len(program.t)), len(program.P[2]) + len(program.J[2])
+        size = n * (n + len(program.t))
+        nonzeros = len(program.P[2]) + len(program.J[2])
         dense = size <= max(MAX_DENSE_ENTRIES, MAX_DENSE_FILL * nonzeros)
     x0 = start[0] if start is not None and backend.starts else None
     if start is not None and backend.name == "proxqp":
@@ -114,12 +122,15 @@ def _call_through_qpsolvers(
     equations, inequalities, lb, ub = program.split_rows(backend.finite)
     a = b = g = h = None
     if len(equations):
-        a, b = program.select_rows(equations, 1.0, dense), program.t[equations]
+        a = program.select_rows(equations, 1.0, dense)
+        b = program.t[equations]
     if len(inequalities):
-        g, h = program.select_rows(inequalities, -1.0, dense), -program.t[inequalities]
+        g = program.select_rows(inequalities, -1.0, dense)
+        h = -program.t[inequalities]
     elif not len(equations) and lb is None:
         # Many backends need a row or a bound, and qpsolvers passes programs without them to LSQR: add 0 x <= 1.
-        g, h = program.select_rows(np.zeros(0, np.int32), 1.0, dense), np.ones(1)
+        g = program.select_rows(np.zeros(0, np.int32), 1.0, dense)
+        h = np.ones(1)
         g.resize((1, n))
     problem = qpsolvers.Problem(program.get_hessian(dense), program.q, g, h, a, b, lb, ub)
     try:
@@ -127,14 +138,24 @@ def _call_through_qpsolvers(
     except TypeError as error:
         if not extra:
             raise
-        raise InputError(f"{backend.name} rejected the settings {', '.join(extra)}: {error}") from None
+        raise InputError(
+            f"{backend.name} rejected the settings {', '.join(extra)}: {error}"
+        ) from None
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, text = _get_status(solution, extras)
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
     lam = program.join_multipliers(solution.y, solution.z, solution.z_box, backend.finite)
     count = _find_value(
-        extras, "iter", "iterations", "num_iterations", "nbIter", "num_iter", "iter_num", "nWSR", "stats"
+        extras,
+        "iter",
+        "iterations",
+        "num_iterations",
+        "nbIter",
+        "num_iter",
+        "iter_num",
+        "nWSR",
+        "stats",
     )
     if isinstance(count, list) and count and isinstance(count[0], dict):
         count = len(count)  # qtqp returns the statistics of each iteration.
@@ -146,7 +167,9 @@ def _call_through_qpsolvers(
     if backend.settings is None:
         message += ", at its own tolerance"
     if backend.jax and not sys.modules["jax"].config.jax_enable_x64:
-        message += "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) changes that"
+        message += (
+            "; JAX computes in 32 bits: jax.config.update('jax_enable_x64', True) changes that"
+        )
     return Answer(status, message, x, lam, work)
 
 
@@ -162,13 +185,19 @@ def _find_value(extras: dict[str, Any], *names: str) -> Any:
 
 def _get_status(solution: Any, extras: dict[str, Any]) -> tuple[Status, str]:
     """Return the status, and the backend's text for it if qpsolvers returns one."""
-    value, flag = _find_value(extras, "status", "exitFlag", "exit_status"), _find_value(extras, "exitFlag")
+    value = _find_value(extras, "status", "exitFlag", "exit_status")
+    flag = _find_value(extras, "exitFlag")
     text = "" if value is None else str(getattr(value, "name", value))
     text = f"status {text}" if text.lstrip("-").isdigit() else text
     if solution.found:
         return Status.CONVERGED, text
     if flag is not None:
-        ecos = {1: Status.INFEASIBLE, 2: Status.INFEASIBLE, 10: Status.STALLED, -1: Status.MAX_ITERATIONS}
+        ecos = {
+            1: Status.INFEASIBLE,
+            2: Status.INFEASIBLE,
+            10: Status.STALLED,
+            -1: Status.MAX_ITERATIONS,
+        }
         return ecos.get(int(flag), Status.NUMERICAL_ERROR), text
     status = classify_status(text)
     return Status.NUMERICAL_ERROR if status is Status.CONVERGED else status, text

@@ -36,7 +36,9 @@ PROBE_PROGRAMS: dict[str, str] = _DATA["programs"]
 ADAPTER_REMEDIES: dict[str, str] = _DATA["remedies"]
 
 
-def _make_backend(comment: str = "", behaviour: dict[str, Any] | None = None, **fields: Any) -> Backend:
+def _make_backend(
+    comment: str = "", behaviour: dict[str, Any] | None = None, **fields: Any
+) -> Backend:
     """Build a backend from its entry in `backends.json`."""
     fields["modules"] = tuple(fields["modules"])
     if "call" in fields:
@@ -64,7 +66,9 @@ def describe_backend(name: str) -> tuple[list[str], list[str]]:
     if behaviour is None:
         return [], []
     usual = _DATA["usual"]
-    measures = [text for key, text in ADAPTER_REMEDIES.items() if getattr(behaviour, key) != usual[key]]
+    measures = [
+        text for key, text in ADAPTER_REMEDIES.items() if getattr(behaviour, key) != usual[key]
+    ]
     return [*describe_behaviour(behaviour).values()], [*dict.fromkeys(measures)]
 
 
@@ -73,7 +77,8 @@ def explain_contradicted_claim(name: str, problem: Problem, status: Status) -> s
     behaviour = get_behaviour(name)
     if behaviour is None:
         return ""
-    sentences, qp = describe_behaviour(behaviour), problem.qp
+    sentences = describe_behaviour(behaviour)
+    qp = problem.qp
     bounds = np.abs([problem.cones.lower, problem.cones.upper] if qp is None else qp.target)
     is_singular = problem.has_singular_program
     is_affected = {

@@ -55,10 +55,14 @@ MAX_CLAIM_ERROR = 1e-3
 # sparse and the dense factorisation take the same time if 1.5 to 2.5 % of the k^2 entries are not zero.
 MAX_SPARSE_ENTRIES = 5e-5
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
-NEAR_SLACK = 1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
+NEAR_SLACK = (
+    1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
+)
 # [-] Shift of the diagonal of a singular or sparse matrix of the step; each refinement reduces its effect.
 STEP_SHIFT, REFINEMENTS_OF_SHIFTED_STEP = 1e-9, 4
-MAX_SINGULAR_STEP_PIVOT = 1e-13  # [-] A dense matrix counts as singular below this ratio of its pivots.
+MAX_SINGULAR_STEP_PIVOT = (
+    1e-13  # [-] A dense matrix counts as singular below this ratio of its pivots.
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,9 @@ class ConvexProgram:
     @cached_property
     def scales(self) -> tuple[FloatArray, FloatArray, float, float]:
         """D (n,), E (m,), sigma and c."""
-        d, e, sigma, c = equilibrate_program(self.P, self.q, self.J, self.t, self.variable, self.free)
+        d, e, sigma, c = equilibrate_program(
+            self.P, self.q, self.J, self.t, self.variable, self.free
+        )
         first = len(self.t) - sum(self.cones)
         for size in self.cones:  # The rows of a cone have one scale.
             e[first : first + size] = e[first : first + size].min()
@@ -104,9 +110,15 @@ class ConvexProgram:
         """The program in scaled variables."""
         hessian, q, jac, t = scale_program(self.P, self.q, self.J, self.t, self.scales)
         return ScaledProgram(
-            P=hessian, q=q, J=jac, t=t, free=self.free, variable=self.variable, cones=self.cones,
+            P=hessian,
+            q=q,
+            J=jac,
+            t=t,
+            free=self.free,
+            variable=self.variable,
+            cones=self.cones,
             definite=self.definite,
-        )  # fmt: skip
+        )
 
     def scale_point(self, x: FloatArray, lam: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Convert x (n,) and multipliers (m,) to the scaled program."""
@@ -180,7 +192,9 @@ class ConvexProgram:
         point: tuple[FloatArray, FloatArray] | None = step.finish()
         return point
 
-    def compare_multipliers_with_slacks(self, x: FloatArray, lam: FloatArray) -> npt.NDArray[np.bool_]:
+    def compare_multipliers_with_slacks(
+        self, x: FloatArray, lam: FloatArray
+    ) -> npt.NDArray[np.bool_]:
         """Return the equations, and the inequalities with a multiplier that exceeds the slack in scaled units.
 
         At the end of an interior point one of the two is far below the other, also on a row with a right-hand side of
@@ -198,7 +212,8 @@ class ConvexProgram:
 
         None if there are more than MAX_FIT_SIZE variables or active rows.
         """
-        rows, scaled = np.flatnonzero(active), self.scaled
+        rows = np.flatnonzero(active)
+        scaled = self.scaled
         if max(len(x), len(rows)) > MAX_FIT_SIZE or not len(rows):
             return None
         x = x / (self.scales[0] * self.scales[2])
@@ -270,7 +285,8 @@ class ScaledProgram(ConvexProgram):
         """
         if x is None or lam is None:
             return False
-        jac, y = self.jacobian, np.append(lam[: self.free], np.maximum(lam[self.free :], 0.0))
+        jac = self.jacobian
+        y = np.append(lam[: self.free], np.maximum(lam[self.free :], 0.0))
         forces = np.abs(jac.T @ y).max(initial=0.0)
         if forces <= MAX_CLAIM_ERROR * np.abs(y).max(initial=0.0) and self.t @ y > 0.0:
             return True
@@ -325,7 +341,9 @@ class ScaledProgram(ConvexProgram):
         """Return the upper triangle of P as `csc_matrix`."""
         return sp.csc_matrix(make_columns(self.P, self.n, None, 1.0, True), (self.n, self.n))
 
-    def join_multipliers(self, y: Any, z: Any, box: Any, bounds_as_rows: bool = False) -> FloatArray:
+    def join_multipliers(
+        self, y: Any, z: Any, box: Any, bounds_as_rows: bool = False
+    ) -> FloatArray:
         """Return lambda (m,) of multipliers with the signs of qpsolvers; missing ones count as 0."""
         fields = self.J, self.variable, self.is_kept, self.n, self.free
         lam: FloatArray = join_multipliers(*fields, y, z, box, bounds_as_rows)
@@ -341,7 +359,8 @@ def _factor_dense(step: Any) -> tuple[Any, int]:
     """Return the solver of the step's equations and the number of its refinements; singular equations are shifted."""
     lapack = import_module_under_lock("scipy.linalg.lapack")
     lu, pivots, info = lapack.dgetrf(step.make_dense(0.0), overwrite_a=True)
-    pivot, refinements = np.abs(lu.diagonal()), 2
+    pivot = np.abs(lu.diagonal())
+    refinements = 2
     if info != 0 or not pivot.min() > MAX_SINGULAR_STEP_PIVOT * pivot.max():
         lu, pivots, _ = lapack.dgetrf(step.make_dense(STEP_SHIFT), overwrite_a=True)
         refinements = REFINEMENTS_OF_SHIFTED_STEP
@@ -351,4 +370,6 @@ def _factor_dense(step: Any) -> tuple[Any, int]:
 def _factor_sparse(step: Any) -> tuple[Any, int]:
     """Return the solver of the step's equations with a shifted diagonal, and the number of its refinements."""
     matrix = sp.csc_matrix(step.make_columns(STEP_SHIFT), (step.size, step.size))
-    return import_module_under_lock("scipy.sparse.linalg").splu(matrix).solve, REFINEMENTS_OF_SHIFTED_STEP
+    return import_module_under_lock("scipy.sparse.linalg").splu(
+        matrix
+    ).solve, REFINEMENTS_OF_SHIFTED_STEP

@@ -56,7 +56,9 @@ class Form:
     name: str  # {"impulse", "velocity", "program"}
     problem: Problem
     program: ConvexProgram
-    unknown_rows: IntpArray  # (k,) int: rows of the problem with impulses that the program determines.
+    unknown_rows: (
+        IntpArray  # (k,) int: rows of the problem with impulses that the program determines.
+    )
     fixed: FloatArray  # [N s] (m,): known impulses of the other rows; 0 for unknown rows.
     recovery: sp.csr_matrix | None = None  # (k, r) or None: S T of the velocity form.
     shift: FloatArray | None = None  # (k,) or None: S r of the velocity form.
@@ -74,11 +76,15 @@ class Form:
         if self.name == "program":
             if not self.problem.has_singular_program:
                 return [lam]
-            return [np.concatenate([np.zeros(len(x)), lam]), np.concatenate([x, np.zeros(len(lam))])]
+            return [
+                np.concatenate([np.zeros(len(x)), lam]),
+                np.concatenate([x, np.zeros(len(lam))]),
+            ]
         y = self._combine(x, lam, 0.0)
         # Remove rounding errors outside of the recession cone of the bounds.
         c = self.problem.cones
-        low, high = np.where(np.isfinite(c.lower), 0.0, -np.inf), np.where(np.isfinite(c.upper), 0.0, np.inf)
+        low = np.where(np.isfinite(c.lower), 0.0, -np.inf)
+        high = np.where(np.isfinite(c.upper), 0.0, np.inf)
         y = np.clip(y, low, high)
         size = np.abs(y).max(initial=0.0)
         return [y / size] if 0.0 < size < np.inf else []
@@ -94,25 +100,30 @@ class Form:
 
     def make_start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return (x, lambda) of a start (m,) [N s]; None in the velocity form."""
-        qp, program = self.problem.qp, self.program
+        qp = self.problem.qp
+        program = self.program
         if self.recovery is not None or program.cones:
             return None
         if self.name == "program":
             x, lam = qp.recover_variables(impulse), qp.select_row_multipliers(impulse)
         else:
             # Values and multipliers of bounds are complementary: both follow from the sum of value and slope.
-            x, lam = impulse[self.unknown_rows], np.zeros(len(program.t))
+            x = impulse[self.unknown_rows]
+            lam = np.zeros(len(program.t))
             slope = (self.problem.csr @ impulse - self.problem.b)[self.unknown_rows]
             diagonal = self.problem.d[self.unknown_rows]
             at = np.flatnonzero(program.variable >= 0)
-            sign, variable = program.J[2][program.J[0][at]], program.variable[at]
+            sign = program.J[2][program.J[0][at]]
+            variable = program.variable[at]
             is_active = sign * (x - slope / diagonal)[variable] <= program.t[at]
             lam[at] = np.where(is_active, np.maximum(sign * slope[variable], 0.0), 0.0)
             x = x.copy()
             x[variable[is_active]] = (sign * program.t[at])[is_active]
         return (x, lam) if np.isfinite(x).all() and np.isfinite(lam).all() else None
 
-    def recover_bound_multiplier(self, x: FloatArray, lam: FloatArray, impulse: FloatArray) -> FloatArray:
+    def recover_bound_multiplier(
+        self, x: FloatArray, lam: FloatArray, impulse: FloatArray
+    ) -> FloatArray:
         """Return the multipliers z (m,) [m/s] of the bounds of the impulses, with A lambda - b + z = 0.
 
         In the impulse form, they are the backend's own; in other forms and on rows that were removed, z = -w.
@@ -120,7 +131,8 @@ class Form:
         z: FloatArray = -self.problem.slack(impulse)
         if self.name == "impulse":
             bounds = np.flatnonzero(self.program.variable >= 0)
-            own, sign = np.zeros(len(x)), self.program.J[2][self.program.J[0][bounds]]
+            own = np.zeros(len(x))
+            sign = self.program.J[2][self.program.J[0][bounds]]
             np.add.at(own, self.program.variable[bounds], -sign * lam[bounds])
             z[self.unknown_rows] = own
         return z
@@ -141,13 +153,18 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
     definite : bool
         Whether the backend needs a positive definite P.
     """
-    form, rows = check_choice("form", form, PROGRAM_FORMS), problem.rows
+    form = check_choice("form", form, PROGRAM_FORMS)
+    rows = problem.rows
     if form == "program" and problem.qp is None:
         raise CapabilityError("form='program' needs a quadratic program (Problem.from_qp)")
     if form in ("impulse", "velocity") and problem.has_singular_program:
-        raise CapabilityError(f"form={form!r} needs a positive definite P; P of this program is singular")
+        raise CapabilityError(
+            f"form={form!r} needs a positive definite P; P of this program is singular"
+        )
     if form == "velocity" and problem.matrix is not None:
-        raise CapabilityError("form='velocity' needs bodies without ellipses, or J and M; this is a matrix")
+        raise CapabilityError(
+            "form='velocity' needs bodies without ellipses, or J and M; this is a matrix"
+        )
     if form != "auto":
         return form
     if problem.qp is not None:
@@ -161,7 +178,9 @@ def choose_program_form(problem: Problem, form: str, definite: bool = False) -> 
             return "impulse"
         root = 1.0 / np.sqrt(problem.d)
         try:
-            pivots = np.square(np.linalg.cholesky(root[:, None] * problem.dense() * root).diagonal())
+            pivots = np.square(
+                np.linalg.cholesky(root[:, None] * problem.dense() * root).diagonal()
+            )
         except np.linalg.LinAlgError:
             return "velocity"
         return "velocity" if (pivots <= MAX_SINGULAR_DELASSUS_PIVOT).any() else "impulse"
@@ -177,9 +196,13 @@ def build_form(problem: Problem, form: str) -> Form:
     if form == "program":
         qp: QuadraticProgram = problem.qp
         return Form(
-            name="program", problem=problem, program=get_program(qp), unknown_rows=np.arange(problem.m),
-            fixed=np.zeros(problem.m), is_definite=not qp.is_singular,
-        )  # fmt: skip
+            name="program",
+            problem=problem,
+            program=get_program(qp),
+            unknown_rows=np.arange(problem.m),
+            fixed=np.zeros(problem.m),
+            is_definite=not qp.is_singular,
+        )
     c = problem.cones
     known = (c.lower == c.upper) & np.isfinite(c.lower)
     fixed = np.where(known, c.lower, 0.0)
@@ -219,7 +242,8 @@ def _list_friction_components(
     index_of[unknown] = np.arange(len(unknown))
     components: list[FrictionComponent] = []
     for block, rows in c.friction_components():
-        normal, tangents = int(index_of[c.ptr[block]]), index_of[list(rows)]
+        normal = int(index_of[c.ptr[block]])
+        tangents = index_of[list(rows)]
         if tangents[0] >= 0:
             ratios = c.friction_coefficient[list(rows)] * root[normal] / root[tangents]
             components.append((normal, tuple(tangents.tolist()), tuple(ratios.tolist())))
@@ -228,7 +252,9 @@ def _list_friction_components(
 
 def _build_impulse_form(problem: Problem, unknown: IntpArray, fixed: FloatArray) -> Form:
     """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem."""
-    c, k, a = problem.cones, len(unknown), problem.csr
+    c = problem.cones
+    k = len(unknown)
+    a = problem.csr
     # Both triangles are made from the lower one, equal in every bit.
     low, off = sp.tril(a[unknown][:, unknown], 0, "coo"), sp.tril(a[unknown][:, unknown], -1, "coo")
     places = np.concatenate([low.row, off.col]), np.concatenate([low.col, off.row])
@@ -244,41 +270,59 @@ def _build_impulse_form(problem: Problem, unknown: IntpArray, fixed: FloatArray)
         if len(tangents) == 1:
             linear += [[(n, a_n), (tangents[0], sign)] for sign in (-1.0, 1.0)]
         else:
-            conic += [[(n, a_n)], *([(t, a_n / a_t)] for t, a_t in zip(tangents, ratios, strict=True))]
+            conic += [
+                [(n, a_n)],
+                *([(t, a_n / a_t)] for t, a_t in zip(tangents, ratios, strict=True)),
+            ]
     lower, upper = c.lower[unknown], c.upper[unknown]
     low, high = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
     bounds = [[(int(i), 1.0)] for i in low] + [[(int(i), -1.0)] for i in high]
     rows = _build_matrix(linear + bounds + conic, k)
     none = np.full(len(linear), -1), np.full(len(conic), -1)
     program = ConvexProgram(
-        P=_get_arrays(hessian), q=q, J=_get_arrays(rows),
-        t=np.concatenate([np.zeros(len(linear)), lower[low], -upper[high], np.zeros(len(conic))]), free=0,
-        variable=np.concatenate([none[0], low, high, none[1]]).astype(np.int32), cones=_list_cone_sizes(components),
-    )  # fmt: skip
+        P=_get_arrays(hessian),
+        q=q,
+        J=_get_arrays(rows),
+        t=np.concatenate([np.zeros(len(linear)), lower[low], -upper[high], np.zeros(len(conic))]),
+        free=0,
+        variable=np.concatenate([none[0], low, high, none[1]]).astype(np.int32),
+        cones=_list_cone_sizes(components),
+    )
     return Form(name="impulse", problem=problem, program=program, unknown_rows=unknown, fixed=fixed)
 
 
 def _build_velocity_form(problem: Problem, unknown: IntpArray, fixed: FloatArray) -> Form:
     """Build the mass-scaled velocity form of a problem with bodies or J and M."""
-    form, c, k, root = problem.velocity_form(), problem.cones, len(unknown), 1.0 / np.sqrt(problem.d[unknown])
+    form = problem.velocity_form()
+    c = problem.cones
+    k = len(unknown)
+    root = 1.0 / np.sqrt(problem.d[unknown])
     # Form K~ = [K, theta^1/2].
-    jac, theta = sp.csr_matrix(form.jacobian), form.theta[unknown]
+    jac = sp.csr_matrix(form.jacobian)
+    theta = form.theta[unknown]
     soft = np.flatnonzero(theta > 0.0)
-    root_theta = sp.csr_matrix((np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft)))
+    root_theta = sp.csr_matrix(
+        (np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft))
+    )
     velocity_map = sp.csr_matrix(sp.hstack([jac[unknown], root_theta]))
-    ny, g = velocity_map.shape[1], form.rhs[unknown]
+    ny = velocity_map.shape[1]
+    g = form.rhs[unknown]
     # Classify bounded rows as free, with a lower bound, with both bounds, or with an upper bound.
     low, high = c.lower[unknown] / root, c.upper[unknown] / root
     components = _list_friction_components(problem, unknown, root)
     is_bounded = np.ones(k, bool)
     is_bounded[[i for n, tangents, _ in components for i in (n, *tangents)]] = False
     has_low, has_high = is_bounded & np.isfinite(low), is_bounded & np.isfinite(high)
-    free, upper = np.flatnonzero(is_bounded & ~has_low & ~has_high), np.flatnonzero(has_high & ~has_low)
+    free = np.flatnonzero(is_bounded & ~has_low & ~has_high)
+    upper = np.flatnonzero(has_high & ~has_low)
     both = np.flatnonzero(has_low & has_high)
     shift = np.where(has_low, low, np.where(has_high, high, 0.0))
     t_of_row = dict(zip(both.tolist(), range(ny, ny + len(both)), strict=True))
-    rows, n_friction = _list_velocity_rows(components, free, np.flatnonzero(has_low), upper, ny, t_of_row)
-    n, r = ny + len(both) + n_friction, len(rows)
+    rows, n_friction = _list_velocity_rows(
+        components, free, np.flatnonzero(has_low), upper, ny, t_of_row
+    )
+    n = ny + len(both) + n_friction
+    r = len(rows)
     # Form the rows T^T K~ with the columns of t, and insert the rows t >= 0 before the cones.
     transposed = _build_matrix([multipliers for multipliers, _ in rows], k)
     velocities = transposed @ velocity_map
@@ -286,8 +330,11 @@ def _build_velocity_form(problem: Problem, unknown: IntpArray, fixed: FloatArray
     velocities = sp.csr_matrix(velocities - _build_matrix([slacks for _, slacks in rows], n))
     slack_rows = _build_matrix([[(i, 1.0)] for i in range(ny, n)], n)
     sizes = _list_cone_sizes(components)
-    first, n_slack = r - sum(sizes), n - ny
-    order = np.concatenate([np.arange(first), r + np.arange(n_slack), np.arange(first, r)]).astype(int)
+    first = r - sum(sizes)
+    n_slack = n - ny
+    order = np.concatenate([np.arange(first), r + np.arange(n_slack), np.arange(first, r)]).astype(
+        int
+    )
     matrix = sp.csr_matrix(sp.vstack([velocities, slack_rows]))[order]
     q = np.zeros(n)
     known = np.zeros(ny)
@@ -297,20 +344,35 @@ def _build_velocity_form(problem: Problem, unknown: IntpArray, fixed: FloatArray
     is_velocity = np.arange(n) < ny
     variable = np.concatenate([np.full(r, -1), np.arange(ny, n)])[order].astype(np.int32)
     program = ConvexProgram(
-        P=_get_arrays(sp.csr_matrix(sp.diags_array(np.where(is_velocity, 1.0, 0.0)))), q=q, J=_get_arrays(matrix),
-        t=np.concatenate([transposed @ g, np.zeros(n_slack)])[order], free=len(free), variable=variable, cones=sizes,
-    )  # fmt: skip
+        P=_get_arrays(sp.csr_matrix(sp.diags_array(np.where(is_velocity, 1.0, 0.0)))),
+        q=q,
+        J=_get_arrays(matrix),
+        t=np.concatenate([transposed @ g, np.zeros(n_slack)])[order],
+        free=len(free),
+        variable=variable,
+        cones=sizes,
+    )
     recovery = sp.vstack([transposed, sp.csr_matrix((n_slack, k))]).tocsr()[order].T
     return Form(
-        name="velocity", problem=problem, program=program, unknown_rows=unknown, fixed=fixed,
-        recovery=sp.csr_matrix(sp.diags_array(root) @ recovery), shift=root * shift, is_definite=not n_slack,
-    )  # fmt: skip
+        name="velocity",
+        problem=problem,
+        program=program,
+        unknown_rows=unknown,
+        fixed=fixed,
+        recovery=sp.csr_matrix(sp.diags_array(root) @ recovery),
+        shift=root * shift,
+        is_definite=not n_slack,
+    )
 
 
 def _get_arrays(matrix: sp.csr_matrix) -> tuple[Any, Any, Any]:
     """Return (indptr, indices, data) of a matrix in compressed rows, with indices of 32 bits."""
     matrix.sort_indices()
-    return matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(float)
+    return (
+        matrix.indptr.astype(np.int32),
+        matrix.indices.astype(np.int32),
+        matrix.data.astype(float),
+    )
 
 
 def _list_velocity_rows(
@@ -330,7 +392,8 @@ def _list_velocity_rows(
     rows += [([(i, 1.0)], [(t_of_row[i], -1.0)] if i in t_of_row else []) for i in lower.tolist()]
     rows += [([(i, -1.0)], []) for i in upper.tolist()]
     first = ny + len(t_of_row)
-    new, t_of_normal = itertools.count(first), dict[int, Entries]()
+    new = itertools.count(first)
+    t_of_normal = dict[int, Entries]()
     # A friction component of one row has t >= |w_t|.
     for normal, tangents, ratios in components:
         if len(tangents) == 1:
@@ -346,11 +409,17 @@ def _list_velocity_rows(
             t_of_normal.setdefault(two[0], []).append((t_of_disk[k], 1.0))
     # Normals without a disk have w_n >= sum of a t; disks are second-order cones.
     has_disk = {disk[0] for disk in disks}
-    rows += [([(normal, 1.0)], entries) for normal, entries in t_of_normal.items() if normal not in has_disk]
+    rows += [
+        ([(normal, 1.0)], entries)
+        for normal, entries in t_of_normal.items()
+        if normal not in has_disk
+    ]
     for k, (normal, tangents, ratios) in enumerate(disks):
         is_second = k in t_of_disk
         rows.append(
-            ([], [(t_of_disk[k], -1.0)]) if is_second else ([(normal, 1.0)], t_of_normal.get(normal, []))
+            ([], [(t_of_disk[k], -1.0)])
+            if is_second
+            else ([(normal, 1.0)], t_of_normal.get(normal, []))
         )
         rows += [([(tangent, ratio)], []) for tangent, ratio in zip(tangents, ratios, strict=True)]
     return rows, next(new) - first

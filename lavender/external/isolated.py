@@ -26,7 +26,9 @@ from lavender.external.convex import ScaledProgram
 from lavender.external.running import Answer, BackendFailed, Limits
 from lavender.judge.solution import Status
 
-START_TIMEOUT = 60.0  # [s] On a loaded machine, importing a backend and its modules may take this long.
+START_TIMEOUT = (
+    60.0  # [s] On a loaded machine, importing a backend and its modules may take this long.
+)
 KILL_TIMEOUT = 10.0  # [s] The end of a killed process is awaited for this long.
 # A backend with a time limit of its own is killed after this multiple of its limit, and at least this time [s] later:
 # some read the clock only every few seconds, and its answer needs time to return.
@@ -46,7 +48,9 @@ class Process:
 
     popen: subprocess.Popen[bytes] | None = None
 
-    def call_function(self, function: Callable[..., Any], *arguments: Any, timeout: float | None) -> Any:
+    def call_function(
+        self, function: Callable[..., Any], *arguments: Any, timeout: float | None
+    ) -> Any:
         """Call a function of a module, and return its result.
 
         Parameters
@@ -70,7 +74,8 @@ class Process:
         process = self.popen
         assert process is not None and process.stdin is not None and process.stdout is not None
         limit = threading.TIMEOUT_MAX if timeout is None else min(timeout, threading.TIMEOUT_MAX)
-        timer, begun = threading.Timer(limit, process.kill), time.monotonic()
+        timer = threading.Timer(limit, process.kill)
+        begun = time.monotonic()
         timer.daemon = True
         try:
             if timeout is not None:
@@ -94,7 +99,9 @@ class Process:
             if time.monotonic() - begun >= limit or process.poll() is not None:
                 self.close()  # The timer may kill it after its answer, too.
         if error is not None:
-            raise (InputError(result) if error == "InputError" else BackendFailed(f"{error}: {result}"))
+            raise (
+                InputError(result) if error == "InputError" else BackendFailed(f"{error}: {result}")
+            )
         return result
 
     def _start(self) -> None:
@@ -103,15 +110,19 @@ class Process:
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         try:
             self.popen = subprocess.Popen(
-                [sys.executable, "-c", SERVE_SCRIPT], env={**os.environ, "PYTHONPATH": path},
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
+                [sys.executable, "-c", SERVE_SCRIPT],
+                env={**os.environ, "PYTHONPATH": path},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
         except OSError as error:
             raise BackendFailed(f"the process of the backend did not start: {error}") from None
 
     def close(self) -> None:
         """Kill the process."""
-        process, self.popen = self.popen, None
+        process = self.popen
+        self.popen = None
         if process is not None:
             process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired, OSError):
@@ -138,7 +149,9 @@ def _call_in_process(function: Callable[..., Any], *arguments: Any, timeout: flo
 
 def start_process(backend: Backend) -> None:
     """Start a process that has imported the backend's code, before the clock of a time limit starts."""
-    with contextlib.suppress(TimeoutError, BackendFailed, InputError):  # The later call raises these errors.
+    with contextlib.suppress(
+        TimeoutError, BackendFailed, InputError
+    ):  # The later call raises these errors.
         _call_in_process(warm_up, backend, timeout=START_TIMEOUT)
 
 
@@ -150,7 +163,9 @@ def run_isolated(
     if timeout is not None and backend.stoppable:
         timeout = max(STOPPABLE_LIMIT_RATIO * timeout, timeout + MIN_STOPPABLE_TIME)
     try:
-        answer: Answer = _call_in_process(backend.run, program, start, limit, settings, timeout=timeout)
+        answer: Answer = _call_in_process(
+            backend.run, program, start, limit, settings, timeout=timeout
+        )
         return answer
     except TimeoutError:
         return Answer(Status.TIME_LIMIT, "ended at the time limit")

@@ -15,7 +15,10 @@ from lavender.judge.solution import Status
 
 
 def call_clarabel(
-    program: ScaledProgram, start: tuple[FloatArray, FloatArray] | None, limit: Limits, extra: dict[str, Any]
+    program: ScaledProgram,
+    start: tuple[FloatArray, FloatArray] | None,
+    limit: Limits,
+    extra: dict[str, Any],
 ) -> Answer:
     """Call Clarabel: interior point, homogeneous embedding, second-order cones (Goulart, Chen 2024)."""
     import clarabel
@@ -46,7 +49,8 @@ def call_clarabel(
     matrix = program.select_rows(rows, -1.0, False)
     data = program.make_upper_triangle(), program.q, matrix, -program.t[rows]
     result = clarabel.DefaultSolver(*data, cones, settings).solve()
-    name, z = str(result.status), np.array(result.z)
+    name = str(result.status)
+    z = np.array(result.z)
     # "Almost infeasible" is a claim, too, because the certificate is checked.
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
     status = Status.INFEASIBLE if almost else classify_status(name)
@@ -69,14 +73,18 @@ def _get_osqp_algebra() -> str:
 
 
 def call_osqp(
-    program: ScaledProgram, start: tuple[FloatArray, FloatArray] | None, limit: Limits, extra: dict[str, Any]
+    program: ScaledProgram,
+    start: tuple[FloatArray, FloatArray] | None,
+    limit: Limits,
+    extra: dict[str, Any],
 ) -> Answer:
     """Call OSQP: operator splitting (Stellato et al. 2020)."""
     import osqp
 
     equations, inequalities, _, _ = program.split_rows(True)
     rows = np.concatenate([equations, inequalities])
-    matrix, low = program.select_rows(rows, 1.0, False), program.t[rows]
+    matrix = program.select_rows(rows, 1.0, False)
+    low = program.t[rows]
     high = np.where(rows < program.free, low, np.inf)
     solver = osqp.OSQP(algebra=_get_osqp_algebra())
     settings = {
@@ -100,15 +108,20 @@ def call_osqp(
         if key not in known:
             raise InputError(f"osqp has no setting {key!r}; known: {', '.join(sorted(known))}")
     try:
-        solver.setup(program.make_upper_triangle(), program.q, matrix, low, high, **(settings | extra))
+        solver.setup(
+            program.make_upper_triangle(), program.q, matrix, low, high, **(settings | extra)
+        )
     except osqp.OSQPException as error:
         # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
-        message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
+        message = (
+            "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
+        )
         return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {message}")
     if start is not None:
         solver.warm_start(x=start[0], y=-start[1][rows])
     result = solver.solve(raise_error=False)
-    info, status = result.info, classify_status(result.info.status)
+    info = result.info
+    status = classify_status(result.info.status)
     x, y = result.x, result.y
     if status is Status.INFEASIBLE:  # Return its certificates in place of the iterate.
         x, y = (

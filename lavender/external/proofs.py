@@ -19,13 +19,17 @@ from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.problem import Problem
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
-FEASIBLE_TOLERANCE = 1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
+FEASIBLE_TOLERANCE = (
+    1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
+)
 # Matrices of more rows or columns are projected by a sparse factor with this shift, which repetitions remove.
 MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 100, 1e-10, 3
 # [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
 # rounding of right-hand sides (2^10 unit roundoffs).
 PROOF_ROUNDING = 2.0**-43
-NEGLIGIBLE_SHARE = 1e-9  # [-] Entries of a proof below this fraction of the largest one are set to 0.
+NEGLIGIBLE_SHARE = (
+    1e-9  # [-] Entries of a proof below this fraction of the largest one are set to 0.
+)
 
 
 @np.errstate(all="ignore")  # Proofs that overflow are not accepted.
@@ -36,7 +40,8 @@ def find_infeasibility_proof(
     if not len(program.t):
         return None
     rows = program.without_cost()
-    scaled, e = rows.scaled.without_far_rows(), rows.scales[1]
+    scaled = rows.scaled.without_far_rows()
+    e = rows.scales[1]
     is_equation = np.arange(len(rows.t)) < rows.free
     candidates = [] if multipliers is None else [multipliers]
     for attempt in range(2):
@@ -56,7 +61,9 @@ def find_infeasibility_proof(
         high = 1.0 if scaled.is_kept is None else scaled.is_kept.astype(float)
         matrix = scaled.jacobian.T
         t = scaled.t * high
-        found = _solve_linear_program(-t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline)
+        found = _solve_linear_program(
+            -t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline
+        )
         if found is None:
             return None
         candidates = [found * e]
@@ -84,9 +91,12 @@ def find_ray(
     for ray in rays:
         # The objective must decrease without end along the ray, up to RAY_TOLERANCE of the terms of each row.
         size = np.abs(ray)
-        slope, limits = jac @ ray, RAY_TOLERANCE * (abs(jac) @ size)
+        slope = jac @ ray
+        limits = RAY_TOLERANCE * (abs(jac) @ size)
         is_level = (np.abs(hessian @ ray) <= RAY_TOLERANCE * (abs(hessian) @ size)).all()
-        is_allowed = (np.abs(slope[:free]) <= limits[:free]).all() and (slope[free:] >= -limits[free:]).all()
+        is_allowed = (np.abs(slope[:free]) <= limits[:free]).all() and (
+            slope[free:] >= -limits[free:]
+        ).all()
         if is_level and is_allowed and scaled.q @ ray < -RAY_TOLERANCE * (np.abs(scaled.q) @ size):
             break
     else:
@@ -94,8 +104,11 @@ def find_ray(
     if x is None or not _is_feasible(program, x):
         if deadline.has_passed():
             return None
-        none, t = np.full(n, np.inf), (scaled.t[:free], scaled.t[free:])
-        found = _solve_linear_program(np.zeros(n), jac[:free], jac[free:], -none, none, deadline, *t)
+        none = np.full(n, np.inf)
+        t = (scaled.t[:free], scaled.t[free:])
+        found = _solve_linear_program(
+            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, *t
+        )
         if found is None:
             return None
         x = found * (scale * sigma)
@@ -121,7 +134,9 @@ def _project_to_kernel(x: FloatArray, matrix: Any) -> FloatArray:
         return out
     shift = -PROJECTION_SHIFT * sp.eye_array(part.shape[0])
     splu = import_module_under_lock("scipy.sparse.linalg").splu
-    solve = splu(sp.csc_array(sp.block_array([[sp.eye_array(len(used)), part.T], [part, shift]]))).solve
+    solve = splu(
+        sp.csc_array(sp.block_array([[sp.eye_array(len(used)), part.T], [part, shift]]))
+    ).solve
     out[used] = x[used]
     for _ in range(PROJECTIONS):
         correction = solve(np.concatenate([np.zeros(len(used)), -(part @ out[used])]))
@@ -145,10 +160,15 @@ def _solve_linear_program(
 ) -> FloatArray | None:
     """Minimise cost.x with equations x = equal_to, inequalities x >= at_least and bounds; None without a point."""
     begin = read_clock()
-    linprog = import_module_under_lock("scipy.optimize").linprog  # It takes 0.1 s, and is seldom needed.
+    linprog = import_module_under_lock(
+        "scipy.optimize"
+    ).linprog  # It takes 0.1 s, and is seldom needed.
     deadline.extend(read_clock() - begin)
     n = len(cost)
-    options: dict[str, Any] = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    options: dict[str, Any] = {
+        "primal_feasibility_tolerance": 1e-10,
+        "dual_feasibility_tolerance": 1e-10,
+    }
     if deadline.is_set:
         options["time_limit"] = deadline.get_remaining_seconds(1e-3)
     bounds = np.stack([np.broadcast_to(low, (n,)), np.broadcast_to(high, (n,))], 1)

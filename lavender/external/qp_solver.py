@@ -26,7 +26,9 @@ from lavender.problem import Problem
 from lavender.problem.program import QuadraticProgram
 from lavender.solvers.registry import Solver
 
-MAX_DENSE_SIZE = 2**30  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
+MAX_DENSE_SIZE = (
+    2**30
+)  # [bytes] A backend for dense matrices rejects a problem with a larger matrix.
 # [-] A claim "solved" is false if the error exceeds this multiple of tol, and at least MIN_FALSE_CLAIM: the tests of
 # backends use other norms.
 FALSE_CLAIM_RATIO, MIN_FALSE_CLAIM = 1e3, 1e-6
@@ -75,31 +77,43 @@ class ProgramJudge:
         """
         _, active, complementary = self.keep(x, lam)
         size = len(x) + len(lam)
-        if self.strict_error > (STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)):
+        if self.strict_error > (
+            STEP_ERROR if size <= MAX_FREE_STEP_SIZE else max(self.tol, STEP_ERROR)
+        ):
             first = self._polish(x, lam, self.program.compare_multipliers_with_slacks(x, lam))
             near = None
             if not is_last:
                 return self.error <= self.tol
-            if self.error > self.tol:  # Rows of almost no slack may be active with a multiplier of 0.
+            if (
+                self.error > self.tol
+            ):  # Rows of almost no slack may be active with a multiplier of 0.
                 near = self._take_step(x, lam, self.program.find_near_rows(x))
             if near is not None:
                 for multipliers in (near[1], complementary, lam if first is None else first[1]):
                     self.keep(near[0], multipliers, True)
                 if self.error > self.tol and not self.deadline.has_passed():
-                    fitted = self.program.fit_multipliers(near[0], self.program.find_near_rows(near[0]))
+                    fitted = self.program.fit_multipliers(
+                        near[0], self.program.find_near_rows(near[0])
+                    )
                     if fitted is not None:
                         self.keep(near[0], fitted, True)
             if self.error > self.tol:
                 self._polish(x, complementary, active)
         return self.error <= self.tol
 
-    def _take_step(self, x: FloatArray, lam: FloatArray, active: Any) -> tuple[FloatArray, FloatArray] | None:
+    def _take_step(
+        self, x: FloatArray, lam: FloatArray, active: Any
+    ) -> tuple[FloatArray, FloatArray] | None:
         """Return the Newton step of a point; None if it is not possible, or too long before the deadline."""
         left = self.deadline.get_remaining_seconds() if self.deadline.is_set else LONG_STEP_TIME
-        max_size = MAX_STEP_SIZE if left >= LONG_STEP_TIME else MAX_SHORT_STEP_SIZE if left > 0.0 else 0
+        max_size = (
+            MAX_STEP_SIZE if left >= LONG_STEP_TIME else MAX_SHORT_STEP_SIZE if left > 0.0 else 0
+        )
         return self.program.polish(x, lam, active, max_size) if max_size else None
 
-    def _polish(self, x: FloatArray, lam: FloatArray, active: Any) -> tuple[FloatArray, FloatArray] | None:
+    def _polish(
+        self, x: FloatArray, lam: FloatArray, active: Any
+    ) -> tuple[FloatArray, FloatArray] | None:
         """Judge the Newton steps from a point with these active rows (m,); return the first one."""
         first = None
         for _ in range(MAX_STEPS):
@@ -111,10 +125,13 @@ class ProgramJudge:
             # Steps from a point without a right digit lead nowhere.
             if self.error <= self.tol or not error <= 1.0:
                 break
-            x, active = point[0], self.program.update_active_rows(*point, active, self.tol)
+            x = point[0]
+            active = self.program.update_active_rows(*point, active, self.tol)
         return first
 
-    def keep(self, x: FloatArray, lam: FloatArray, has_step: bool = False) -> tuple[float, Any, FloatArray]:
+    def keep(
+        self, x: FloatArray, lam: FloatArray, has_step: bool = False
+    ) -> tuple[float, Any, FloatArray]:
         """Judge a point, clipped to the bounds of the variables, and store it if it is the best."""
         x = self.program.clip_to_bounds(x)
         error, strict_error, _, _, active, complementary = self.program.judge(x, lam)
@@ -162,7 +179,9 @@ class ContactJudge:
             return
         judged = judge_impulse(self.form.problem, impulse)
         if judged.relative < self.relative or self.dual is None:
-            self.relative, self.above, self.impulse[:] = judged.relative, judged.above_floor, impulse
+            self.relative = judged.relative
+            self.above = judged.above_floor
+            self.impulse[:] = impulse
             self.dual = self.form.recover_bound_multiplier(x, lam, impulse)
 
 
@@ -177,7 +196,9 @@ class QPSolver(Solver):
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings, Mapping):
-            raise InputError(f"settings is a {type(self.settings).__name__}; a mapping of names is needed")
+            raise InputError(
+                f"settings is a {type(self.settings).__name__}; a mapping of names is needed"
+            )
         if self.isolate is not None:
             check_bool("isolate", self.isolate)
 
@@ -228,17 +249,34 @@ class QPSolver(Solver):
         return judge, self._call(program, judge, budget, tol, deadline, start)
 
     def _call(
-        self, program: ConvexProgram, judge: Any, max_iter: int, tol: float, deadline: Deadline, start: Any
+        self,
+        program: ConvexProgram,
+        judge: Any,
+        max_iter: int,
+        tol: float,
+        deadline: Deadline,
+        start: Any,
     ) -> BackendResult:
         """Call the backend, in another process under a time limit, until the judge accepts its point."""
         b = self.backend
         is_isolated = bool(self.isolate) or (self.is_isolated and deadline.is_set)
         call = partial(run_isolated, b) if is_isolated else b.run
         result = call_backend_until_accepted(
-            program, judge, call, max_iter=max_iter, tol=tol, deadline=deadline, settings=self.settings,
-            start=start, needs_definite=b.needs_definite, first_tolerance=b.first_tolerance, interior=b.interior,
-            call_iterations=int(min(b.max_iter, b.row_iterations * (len(program.q) + len(program.t)))),
-        )  # fmt: skip
+            program,
+            judge,
+            call,
+            max_iter=max_iter,
+            tol=tol,
+            deadline=deadline,
+            settings=self.settings,
+            start=start,
+            needs_definite=b.needs_definite,
+            first_tolerance=b.first_tolerance,
+            interior=b.interior,
+            call_iterations=int(
+                min(b.max_iter, b.row_iterations * (len(program.q) + len(program.t)))
+            ),
+        )
         if deadline.is_set and not (b.stoppable and not b.overruns):
             limit = "reads its time limit rarely" if b.stoppable else "accepts no time limit"
             manner = "in a separate process" if is_isolated else "to its end"
@@ -247,12 +285,20 @@ class QPSolver(Solver):
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def run(
-        self, state: Form, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self,
+        state: Form,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
-        form, no_work = state, {"backend_calls": 0}
+        form = state
+        no_work = {"backend_calls": 0}
         if not len(form.unknown_rows):
             impulse[:] = form.fixed
-            return Claim(Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", form.name)
+            return Claim(
+                Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", form.name
+            )
         if max_iter == 0:
             return Claim(Status.MAX_ITERATIONS, 0, no_work, "", form.name)
         if tol > 0.0 and judge_impulse(form.problem, impulse).relative == 0.0:
@@ -263,27 +309,39 @@ class QPSolver(Solver):
             judge, result = self.solve_program(form.problem.qp, tol, max_iter, deadline, start)
             if judge.x is not None and judge.lam is not None:
                 impulse[:] = form.recover_impulse(judge.x, judge.lam)
-            above, error = judge_impulse(form.problem, impulse).above_floor, judge.error
+            above = judge_impulse(form.problem, impulse).above_floor
+            error = judge.error
             dual: FloatArray | None = form.recover_bound_multiplier(impulse, impulse, impulse)
         else:
             contact = ContactJudge(form, impulse, tol)
             result = self._call(form.program, contact, max_iter, tol, deadline, start)
             above, dual, error = contact.above, contact.dual, contact.relative
-        status, certificate = result.status, None
+        status = result.status
+        certificate = None
         is_false = status is Status.CONVERGED and error > get_false_claim_error(tol)
         if (status is Status.INFEASIBLE or is_false) and result.point is not None:
             # A point of a program without a solution may be a certificate, because it grows without limit.
             candidates = form.list_certificates(*result.point)
-            certificate = next((y for y in candidates if check_certificate(form.problem, y) is None), None)
+            certificate = next(
+                (y for y in candidates if check_certificate(form.problem, y) is None), None
+            )
             status = status if certificate is None else Status.INFEASIBLE
         if status is not Status.INFEASIBLE and above <= tol and tol > 0.0:
             status = Status.CONVERGED
-        elif status in (Status.CONVERGED, Status.NUMERICAL_ERROR) and not (is_false and not result.shift):
+        elif status in (Status.CONVERGED, Status.NUMERICAL_ERROR) and not (
+            is_false and not result.shift
+        ):
             # The backend's tests use other norms than the judge, or another P, so its claim is not false.
             status = Status.STALLED if np.isfinite(error) else Status.NUMERICAL_ERROR
         return Claim(
-            status, result.iterations, result.work, result.message, form.name, dual=dual, certificate=certificate
-        )  # fmt: skip
+            status,
+            result.iterations,
+            result.work,
+            result.message,
+            form.name,
+            dual=dual,
+            certificate=certificate,
+        )
 
     def start_workers(self, state: Form | None, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""

@@ -19,8 +19,14 @@ from lavender.base.errors import InputError
 from lavender.external.convex import ConvexProgram, ScaledProgram
 from lavender.judge.solution import Status, sum_work_counts
 
-FIRST_TOLERANCE, SECOND_TOLERANCE = 1e-3, 1e-5  # [-] Tolerances of the two calls, as multiples of tol.
-MIN_TOLERANCES = 1e-11, 1e-12  # Smallest tolerances of the two calls: rounding prevents smaller residuals.
+FIRST_TOLERANCE, SECOND_TOLERANCE = (
+    1e-3,
+    1e-5,
+)  # [-] Tolerances of the two calls, as multiples of tol.
+MIN_TOLERANCES = (
+    1e-11,
+    1e-12,
+)  # Smallest tolerances of the two calls: rounding prevents smaller residuals.
 # Gap of the second call: an interior-point method leaves an error of the square root of the gap on a row on which
 # multiplier and slack vanish together.
 SECOND_GAP = 1e-16
@@ -61,7 +67,9 @@ class BackendResult:
     status: Status
     message: str
     work: dict[str, int]
-    point: tuple[FloatArray, FloatArray] | None = None  # x and multipliers; with INFEASIBLE, perhaps proofs.
+    point: tuple[FloatArray, FloatArray] | None = (
+        None  # x and multipliers; with INFEASIBLE, perhaps proofs.
+    )
     shift: float = 0.0  # Number that was added to the diagonal of the scaled P.
 
     @property
@@ -78,7 +86,9 @@ class PointJudge(Protocol):
         ...
 
 
-Call = Callable[[ScaledProgram, "tuple[FloatArray, FloatArray] | None", Limits, "dict[str, Any]"], Answer]
+Call = Callable[
+    [ScaledProgram, "tuple[FloatArray, FloatArray] | None", Limits, "dict[str, Any]"], Answer
+]
 
 
 class BackendFailed(Exception):
@@ -123,7 +133,9 @@ def call_backend_until_accepted(
         gap = SECOND_GAP if attempt else eps
         left = max_iter - work.get("iterations", 0)
         if not attempt:
-            left = min(left, call_iterations, MAX_INTERIOR_ITERATIONS if interior else call_iterations)
+            left = min(
+                left, call_iterations, MAX_INTERIOR_ITERATIONS if interior else call_iterations
+            )
         elif interior:
             left = min(left, work.get("iterations", left) + MORE_INTERIOR_ITERATIONS)
         limits = Limits(eps, gap, left, deadline.get_remaining_seconds(1e-6))
@@ -132,28 +144,40 @@ def call_backend_until_accepted(
         work = sum_work_counts((work, {"backend_calls": 1}, answer.work))
         message = answer.message
         if scaled.shift:
-            message += f"; {scaled.shift:.1g} was added to the diagonal of the singular P, in scaled units"
+            message += (
+                f"; {scaled.shift:.1g} was added to the diagonal of the singular P, in scaled units"
+            )
         result = BackendResult(answer.status, message, work, shift=scaled.shift)
         accepted = is_unfounded = False
         if answer.status is Status.INFEASIBLE:
-            is_unfounded = not attempt and not scaled.is_nearly_proven_unsolvable(answer.x, answer.lam)
+            is_unfounded = not attempt and not scaled.is_nearly_proven_unsolvable(
+                answer.x, answer.lam
+            )
         if answer.x is not None and answer.lam is not None:
             point = program.restore_point(answer.x, answer.lam)
             result.point = point
             accepted = not is_unfounded and judge.accepts(*point, attempt > 0)
-        is_better = best is None or accepted or best.status in (Status.NUMERICAL_ERROR, Status.TIME_LIMIT)
+        is_better = (
+            best is None or accepted or best.status in (Status.NUMERICAL_ERROR, Status.TIME_LIMIT)
+        )
         if is_better or answer.status in OUT_OF_BUDGET:
             best = result
         assert best is not None
         best.work = work
         used = work.get("iterations", 0)
-        is_last = used >= max_iter or deadline.has_passed() or (answer.status in FINAL and not is_unfounded)
+        is_last = (
+            used >= max_iter
+            or deadline.has_passed()
+            or (answer.status in FINAL and not is_unfounded)
+        )
         # A limit of iterations in `settings` ends both calls.
         if accepted or is_last or (answer.status is Status.MAX_ITERATIONS and used < left):
             break
     assert best is not None
     if best.iterations > max_iter:
-        best.message = f"{best.message}; {best.iterations} iterations, more than the limit of {max_iter}"
+        best.message = (
+            f"{best.message}; {best.iterations} iterations, more than the limit of {max_iter}"
+        )
     return best
 
 
@@ -171,13 +195,16 @@ def _call_backend_once(
         raise
     except BackendFailed as failure:
         return Answer(Status.NUMERICAL_ERROR, str(failure))
-    except BaseException as error:  # A backend may raise anything; a panic of Rust is not an Exception.
+    except (
+        BaseException
+    ) as error:  # A backend may raise anything; a panic of Rust is not an Exception.
         return Answer(Status.NUMERICAL_ERROR, f"{type(error).__name__}: {error}")
     x, lam = answer.x, answer.lam
     is_valid = x is not None and len(x) == scaled.n and bool(np.isfinite(x).all())
     if is_valid and lam is not None and len(lam) == len(scaled.t):
         return answer
-    status, message = answer.status, f"{answer.message}; no iterate".removeprefix("; ")
+    status = answer.status
+    message = f"{answer.message}; no iterate".removeprefix("; ")
     if status not in (Status.INFEASIBLE, Status.TIME_LIMIT, Status.INTERRUPTED):
         status = Status.NUMERICAL_ERROR
     return Answer(status, message, work=answer.work)
@@ -204,7 +231,9 @@ class _SharedContext:
     """A context manager of the whole process: the first thread that needs it enters it, and the last leaves it."""
 
     def __init__(self, make_context: Callable[[], contextlib.AbstractContextManager[Any]]) -> None:
-        self._make_context, self._lock, self._n_threads = make_context, threading.Lock(), 0
+        self._make_context = make_context
+        self._lock = threading.Lock()
+        self._n_threads = 0
 
     def __enter__(self) -> None:
         with self._lock:
@@ -246,7 +275,10 @@ def _discard_output() -> Iterator[None]:
         os.close(null)
 
 
-_without_warnings, _without_output = _SharedContext(_ignore_warnings), _SharedContext(_discard_output)
+_without_warnings, _without_output = (
+    _SharedContext(_ignore_warnings),
+    _SharedContext(_discard_output),
+)
 
 
 @contextlib.contextmanager

@@ -27,4 +27,12 @@ from lavender.gradient.batch import Derivatives, derivatives
 from lavender.gradient.derivative import Derivative, Tangent, Unique, derivative
 from lavender.gradient.result import Gradient
 
-__all__ = ["Derivative", "Derivatives", "Gradient", "Tangent", "Unique", "derivative", "derivatives"]
+__all__ = [
+    "Derivative",
+    "Derivatives",
+    "Gradient",
+    "Tangent",
+    "Unique",
+    "derivative",
+    "derivatives",
+]

@@ -45,19 +45,28 @@ class Gradients(_PerProblem, GradientArrays):
     """
 
     def __init__(self, of: Derivatives, numbers: FloatArray, separate: dict[int, Gradient]) -> None:
-        self._n, self._of, self._numbers, self._separate = len(of), of, numbers, separate
+        self._n = len(of)
+        self._of = of
+        self._numbers = numbers
+        self._separate = separate
 
     @cached_property
     def _items(self) -> list[Gradient]:
         parts = map(self._of._linears.result_slice, range(self._n))
-        made = (Gradient(d, self._numbers[part]) for d, part in zip(self._of._items, parts, strict=True))
+        made = (
+            Gradient(d, self._numbers[part]) for d, part in zip(self._of._items, parts, strict=True)
+        )
         return [self._separate.get(i, gradient) for i, gradient in enumerate(made)]
 
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
+    if (
+        not TYPE_CHECKING
+    ):  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             if name.startswith("_") or name not in INPUTS or name in MATRICES:
-                raise AttributeError(f"gradients of all problems have no {name!r}; gradients[i] may have it")
+                raise AttributeError(
+                    f"gradients of all problems have no {name!r}; gradients[i] may have it"
+                )
             if not self._separate and name in ("b", "target", "v_free"):
                 return self._numbers[self._of._linears.result_indices(name == "v_free")]
             return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
@@ -66,8 +75,13 @@ class Gradients(_PerProblem, GradientArrays):
 class Derivatives(_PerProblem):
     """Derivatives of many problems, prepared by `lavender.derivatives`: `[i]` is the `Derivative` of problem i."""
 
-    def __init__(self, problems: list[Problem], linears: Linears, separate: dict[int, Derivative]) -> None:
-        self._n, self._problems, self._linears, self._separate = len(problems), problems, linears, separate
+    def __init__(
+        self, problems: list[Problem], linears: Linears, separate: dict[int, Derivative]
+    ) -> None:
+        self._n = len(problems)
+        self._problems = problems
+        self._linears = linears
+        self._separate = separate
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle problems and impulses only; the copy prepares the derivatives again."""
@@ -93,14 +107,19 @@ class Derivatives(_PerProblem):
         CapabilityError
             `Derivative.vjp` raises it.
         """
-        n, arguments = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
+        n = len(self)
+        arguments = {"velocity": velocity, "impulse": impulse, "slack": slack}
         cotangents = {
-            name: [None] * n if x is None else check_sequence(name, x, "cotangents, one for each problem,")
+            name: [None] * n
+            if x is None
+            else check_sequence(name, x, "cotangents, one for each problem,")
             for name, x in arguments.items()
         }
         for name, x in cotangents.items():
             if len(x) != n:
-                raise InputError(f"{name} has {len(x)} cotangents for {n} problems; one for each is needed")
+                raise InputError(
+                    f"{name} has {len(x)} cotangents for {n} problems; one for each is needed"
+                )
         numbers, remaining = self._linears.adjoint(*cotangents.values())
         separate = {}
         for i in [*self._separate, *remaining]:
@@ -132,14 +151,20 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         the problem's index.
     """
     if isinstance(problems, Problem):
-        raise InputError("problems is one Problem; a list of problems is needed, or `lavender.derivative`")
+        raise InputError(
+            "problems is one Problem; a list of problems is needed, or `lavender.derivative`"
+        )
     problems = check_sequence("problems", problems, "Problems")
     is_batch = isinstance(solutions, Solutions) and not solutions.faults
     impulses: Any = solutions
     if not is_batch:
-        impulses = [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
+        impulses = [
+            getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")
+        ]
     if len(problems) != len(impulses):
-        raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
+        raise InputError(
+            f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed"
+        )
     flat = impulses.flat_impulses if is_batch else impulses
     linears = Linears([_get_data(p) for p in problems], flat, MAX_KERNEL_ROWS)
     separate = {}

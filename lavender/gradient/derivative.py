@@ -22,7 +22,9 @@ from lavender_ext.derivative.linear import CASES, Linear, write_body_wrenches
 
 # A solution is rejected if its relative residual exceeds this and its round-off floor.
 MAX_ACCEPTED_RESIDUAL = 1e-8
-MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of its largest entry count as rounding.
+MAX_NULL_ENTRY = (
+    1e-6  # Entries of a null vector up to this fraction of its largest entry count as rounding.
+)
 # A right-hand side of G x = r counts as unsolvable if its cosine with a null vector of G^T is larger than this.
 MAX_NULL_COSINE = 1e-3
 # `Derivative.switching` reports blocks within this many estimated errors of another state. The factor covers that the
@@ -60,11 +62,17 @@ class Unique:
 
     def __str__(self) -> str:
         lines = []
-        for name, flags in (("impulse", self.impulse), ("slack", self.slack), ("target", self.target)):
+        for name, flags in (
+            ("impulse", self.impulse),
+            ("slack", self.slack),
+            ("target", self.target),
+        ):
             rows = np.flatnonzero(~flags)
             if len(rows):
                 names = ", ".join(self._problem.row_name(int(i)) for i in rows[:3])
-                lines.append(f"{name}: not of {len(rows)} rows ({names}{', ...' if len(rows) > 3 else ''})")
+                lines.append(
+                    f"{name}: not of {len(rows)} rows ({names}{', ...' if len(rows) > 3 else ''})"
+                )
         return "; ".join(lines) or "all quantities are unique"
 
 
@@ -106,7 +114,9 @@ class Derivative:
     """
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
-        self.problem, self._linear, self.m = problem, linear, problem.m
+        self.problem = problem
+        self._linear = linear
+        self.m = problem.m
         if not linear.tried and linear.rows <= MAX_KERNEL_ROWS:
             factor_dense(problem.disk, linear)
         regular = linear.regular if linear.rows <= MAX_KERNEL_ROWS else self._system.of_kernel
@@ -122,7 +132,9 @@ class Derivative:
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of this problem's data by which there are gradients."""
-        return tuple(name for name, operators in INPUTS.items() if self.problem.operator in operators)
+        return tuple(
+            name for name, operators in INPUTS.items() if self.problem.operator in operators
+        )
 
     @cached_property
     def _system(self) -> System:
@@ -164,7 +176,8 @@ class Derivative:
             return p.generalized.solve(y)
         rows = p.rows
         assert rows is not None
-        out, y = np.empty((rows.n_bodies, 6)), y.reshape(-1, 6)
+        out = np.empty((rows.n_bodies, 6))
+        y = y.reshape(-1, 6)
         out[:, :3] = rows.inv_mass[:, None] * y[:, :3]
         out[:, 3:] = np.einsum("ijk,ik->ij", rows.inv_inertia, y[:, 3:])
         return out.ravel()
@@ -213,10 +226,14 @@ class Derivative:
 
         The derivatives are not zero, because D_j^1/2 of an ellipse's row is proportional to 1 / e_j.
         """
-        rows = np.flatnonzero(np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr)))
+        rows = np.flatnonzero(
+            np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr))
+        )
         rows = rows[self.problem.cones.friction_rows[rows]]
-        root, e = self._root[rows], self.problem.cones.friction_coefficient[rows]
-        lam, w = self._impulse[rows], (self._linear.slack / self.problem.cones.stretch)[rows]
+        root = self._root[rows]
+        e = self.problem.cones.friction_coefficient[rows]
+        lam = self._impulse[rows]
+        w = (self._linear.slack / self.problem.cones.stretch)[rows]
         has_friction = e > 0.0
         e = np.where(has_friction, e, 1.0)
         dz_de = np.where(has_friction, root * lam / e, 0.0)
@@ -224,12 +241,15 @@ class Derivative:
 
     def _solve(self, r: FloatArray, check: bool = False) -> FloatArray:
         """Solve G x = r on all rows; with `check`, raise CapabilityError if there is no solution."""
-        x, rows = r.copy(), self._system_rows
+        x = r.copy()
+        rows = self._system_rows
         # On rows outside of the system, G is the identity: move their contribution to the right-hand side.
         x[rows] = 0.0
         rhs = r
         if x.any():
-            rhs = r - self._linear.multiply_projection_derivative(self._apply_a(x / self._root) / self._root)
+            rhs = r - self._linear.multiply_projection_derivative(
+                self._apply_a(x / self._root) / self._root
+            )
         rhs = rhs[rows]
         if check and self._system.has_null_component(rhs, MAX_NULL_COSINE, True):
             self._check_row_changes("no derivative along this change exists")
@@ -257,7 +277,8 @@ class Derivative:
         """
         if self.problem.law != "cone" or not self._system.singular:
             return
-        cones, rows = self.problem.cones, self._system_rows
+        cones = self.problem.cones
+        rows = self._system_rows
         ones = np.ones(cones.n_blocks)
         changes = (ones if name == key else None for key in COEFFICIENT_INPUTS)
         de = self._coefficient_rows.compute_row_coefficient_changes(*changes)
@@ -267,7 +288,9 @@ class Derivative:
         size = MAX_NULL_COSINE * np.sqrt(np.bincount(block, r * r))
         for q in self._system.draw_null_vectors(True):
             if (np.abs(np.bincount(block, q * r)) > size * float(np.linalg.norm(q))).any():
-                self._check_row_changes(f"no derivative by {name} of one contact (jvp: of several) exists")
+                self._check_row_changes(
+                    f"no derivative by {name} of one contact (jvp: of several) exists"
+                )
 
     # -- adjoint and forward products ------------------------------------------------------------
 
@@ -297,23 +320,35 @@ class Derivative:
         """
         p = self.problem
         if velocity is None and impulse is None and slack is None:
-            raise InputError("no cotangent of the solution is given; give velocity=, impulse= or slack=")
+            raise InputError(
+                "no cotangent of the solution is given; give velocity=, impulse= or slack="
+            )
         adjoint = self._linear.adjoint(velocity, impulse, slack) if self._uses_kernel else None
         if adjoint is not None:
             return Gradient(self, adjoint)
-        y = None if velocity is None else as_array("velocity", velocity, self._velocity_shape()).reshape(-1)
+        y = (
+            None
+            if velocity is None
+            else as_array("velocity", velocity, self._velocity_shape()).reshape(-1)
+        )
         c = np.zeros(p.m) if impulse is None else as_array("impulse", impulse, (p.m,))
         x = None if slack is None else as_array("slack", slack, (p.m,))
-        return Gradient(self, (self._linear.adjoint if self._uses_kernel else self._solve_adjoint)(y, c, x))
+        return Gradient(
+            self, (self._linear.adjoint if self._uses_kernel else self._solve_adjoint)(y, c, x)
+        )
 
-    def _solve_adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
+    def _solve_adjoint(
+        self, y: FloatArray | None, c: FloatArray, x: FloatArray | None
+    ) -> FloatArray:
         """Return q, s (m), f = y - J^T s (nv) and c (m) of (4), concatenated. A problem given as a matrix has no f."""
-        p, rhs = self.problem, c.copy()
+        p = self.problem
+        rhs = c.copy()
         if x is not None:
             rhs += self._apply_a(x, True)
         if y is not None:
             rhs += self._apply_jacobian(self._apply_inverse_mass(y))
-        scaled, q = (rhs / self._root)[self._system_rows], np.zeros(p.m)
+        scaled = (rhs / self._root)[self._system_rows]
+        q = np.zeros(p.m)
         # Slacks and velocities are unique if A comes from bodies or J and M and the law is convex: no check is needed.
         needs_check = p.matrix is not None or p.law == "coulomb" or c.any()
         if needs_check and self._system.has_null_component(scaled, MAX_NULL_ENTRY, False):
@@ -359,7 +394,10 @@ class Derivative:
         """
         p, linear = self.problem, self._linear
         data = self._check_changes(changes)
-        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db is the change of w at constant impulses.
+        r, dw = (
+            np.zeros(p.m),
+            np.zeros(p.m),
+        )  # dw = dA lambda - db is the change of w at constant impulses.
         for name in ("b", "target"):
             dw -= data.get(name, 0.0)
         for name, weight in zip(("lower", "upper"), self._bound_weights, strict=True):
@@ -401,14 +439,19 @@ class Derivative:
         if not self.problem.cones.has_ellipse:
             return linear.multiply_projection_derivative(de, False, True)
         rows, dz_de, dy_de = self._ellipse_terms
-        dz, dy, others = np.zeros(len(de)), np.zeros(len(de)), de.copy()
-        dz[rows], dy[rows], others[rows] = dz_de * de[rows], dy_de * de[rows], 0.0
+        dz = np.zeros(len(de))
+        dy = np.zeros(len(de))
+        others = de.copy()
+        dz[rows] = dz_de * de[rows]
+        dy[rows] = dy_de * de[rows]
+        others[rows] = 0.0
         changed: FloatArray = linear.multiply_projection_derivative(others, False, True) + dz
         return changed - linear.multiply_projection_derivative(dy)
 
     def _check_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Convert the changes of data to arrays; raise InputError for invalid ones."""
-        p, out = self.problem, {}
+        p = self.problem
+        out = {}
         names = [name for name in self.inputs if name != "coefficients"]
         for name, value in changes.items():
             if name not in names:
@@ -416,12 +459,22 @@ class Derivative:
                     f"{name!r} is not among the data of this problem ({p.operator}): there are {', '.join(names)}"
                 )
             if name in MATRICES:
-                like = p.matrix if name == "A" else p.jacobian if name == "J" else p.generalized.mass  # type: ignore[union-attr]
-                out[name] = as_csr(name, value) if issparse(value) else as_array(name, value, like.shape)
+                if name == "M":
+                    like = p.generalized.mass  # type: ignore[union-attr]
+                else:
+                    like = p.matrix if name == "A" else p.jacobian
+                out[name] = (
+                    as_csr(name, value) if issparse(value) else as_array(name, value, like.shape)
+                )
                 if out[name].shape != like.shape:
                     raise InputError(f"{name} has shape {out[name].shape}; {like.shape} is needed")
-                if name == "M" and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max():
-                    raise InputError("the change of M must be symmetric, because M is: give both triangles")
+                if (
+                    name == "M"
+                    and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max()
+                ):
+                    raise InputError(
+                        "the change of M must be symmetric, because M is: give both triangles"
+                    )
             elif name in COEFFICIENT_INPUTS:
                 is_pair = name == "mu" and np.ndim(value) == 2
                 out[name] = as_array(name, value, (p.n_blocks, 2) if is_pair else (p.n_blocks,))
@@ -431,7 +484,9 @@ class Derivative:
             else:
                 out[name] = as_array(name, value, (p.m,))
         if not out:
-            raise InputError(f"no change of the data is given; give at least one of {', '.join(names)}")
+            raise InputError(
+                f"no change of the data is given; give at least one of {', '.join(names)}"
+            )
         return out
 
     # -- existence -------------------------------------------------------------------------------
@@ -439,8 +494,12 @@ class Derivative:
     @cached_property
     def unique(self) -> Unique:
         """Uniqueness of impulse, slack and target by row; linearly dependent rows can share a load in many ways."""
-        p, m = self.problem, self.problem.m
-        impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
+        p = self.problem
+        m = self.problem.m
+        impulse = np.ones((3, m), bool)[0]
+        slack = np.ones(m, bool)
+        target = np.ones(m, bool)
+        velocity = True
         rows = self._system_rows
         for z in self._system.draw_null_vectors(False):
             x = np.zeros(m)
@@ -474,7 +533,12 @@ class Derivative:
                 y = abs(p.whitened)
                 assert p.compliance is not None
                 size = np.abs(p.b) + (y @ (y.T @ x) + p.compliance * x)
-            rounding = UNIT_ROUNDOFF * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
+            rounding = (
+                UNIT_ROUNDOFF
+                * size
+                / self._root
+                * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
+            )
             error = np.zeros(p.m)
             for r in (-linear.residual, linear.multiply_projection_derivative(rounding)):
                 dz = self._solve(r)
@@ -493,7 +557,9 @@ class Derivative:
     def distance_in_errors(self) -> FloatArray:
         """`distance` (k,) divided by the block's estimated error: the next step of Newton's method plus rounding."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self._estimated_error)
+            distance: FloatArray = np.where(
+                self.distance == 0.0, 0.0, self.distance / self._estimated_error
+            )
         return distance
 
     @cached_property
@@ -518,7 +584,9 @@ class Derivative:
         if self.switching:
             rows = self.problem.cones.ptr[list(self.switching[:3])]
             names = ", ".join(self.problem.row_name(int(row)) for row in rows)
-            notes.append(f"{len(self.switching)} about to switch ({names}): one of several derivatives")
+            notes.append(
+                f"{len(self.switching)} about to switch ({names}): one of several derivatives"
+            )
         if not self.unique:
             notes.append(f"not unique: {self.unique}")
         return "; ".join(notes)

@@ -31,7 +31,9 @@ class Step:
 
     # Blocks of the rows. The coefficients `cones.mu` are not used; mu is an argument.
     cones: Cones = field(compare=False)
-    bounds: tuple[bytes, ...]  # Contents of all other fields of `cones`, by which two steps are compared.
+    bounds: tuple[
+        bytes, ...
+    ]  # Contents of all other fields of `cones`, by which two steps are compared.
     friction: str
     solver: str
     tol: float
@@ -46,7 +48,13 @@ class Step:
                 mu_of_block[is_contact] = mu
                 cones = replace(cones, mu=mu_of_block)
             yield Problem.from_jacobian(
-                jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction
+                jac,
+                mass,
+                free,
+                target=target,
+                cones=cones,
+                compliance=compliance,
+                friction=self.friction,
             )
 
     def forward(self, *arrays: Any) -> tuple[FloatArray, FloatArray]:
@@ -75,7 +83,9 @@ class Step:
         sizes = ((x, x.shape[-1]) for x in arrays[len(arguments) :])
         impulses, y, c = (np.broadcast_to(x, (*batch, n)).reshape(prod(batch), n) for x, n in sizes)
         problems = list(self.iterate_problems(flat))
-        for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
+        for p, g in zip(
+            problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True
+        ):
             for out, name, is_needed, like in zip(gradients, ARGUMENTS, needed, flat, strict=True):
                 if not is_needed:
                     out.append(np.zeros(like.shape[1:]))
@@ -85,7 +95,9 @@ class Step:
                     out.append(g.full(name) if name in ("J", "M") else getattr(g, name))
         shapes = ((x.shape[1:], np.shape(like)) for x, like in zip(flat, arguments, strict=True))
         parts = zip(gradients, shapes, strict=True)
-        return tuple(_sum_to_shape(np.array(x).reshape(*batch, *own), shape) for x, (own, shape) in parts)
+        return tuple(
+            _sum_to_shape(np.array(x).reshape(*batch, *own), shape) for x, (own, shape) in parts
+        )
 
 
 def _flatten_batch(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:
@@ -130,7 +142,9 @@ def infer_result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[i
     return (*batch, nv), (*batch, m)
 
 
-def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float) -> Step:
+def make_step(
+    arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float
+) -> Step:
     """Build the `Step` of these arrays; if `cones` is None, the rows are divided evenly among one contact per mu."""
     m, k = arrays[0].shape[-2], arrays[3].shape[-1]
     if cones is None:
@@ -146,11 +160,15 @@ def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver:
             f"cones have {cones.n_rows} rows and {contacts} contacts; they must have the {m} rows of J, and "
             f"a contact for each of the {k} values of mu"
         )
-    bounds = tuple(np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu")
+    bounds = tuple(
+        np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu"
+    )
     step = Step(cones, bounds, friction, solver, tol)
     try:
         return _reuse_equal_step(step)
-    except TypeError:  # An invalid solver or tolerance may not be hashable; the solve raises the error.
+    except (
+        TypeError
+    ):  # An invalid solver or tolerance may not be hashable; the solve raises the error.
         return step
 
 

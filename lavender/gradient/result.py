@@ -17,7 +17,9 @@ MATRICES = ("A", "J", "M")
 # Data by which solutions can be differentiated -> forms of problems that have these data (see `OPERATORS`). In `jvp`,
 # mu may have the shape (k, 2) of `coefficients`.
 INPUTS = {
-    **dict.fromkeys(("b", "lower", "upper", "mu", "coefficients", "patch_radius", "rolling"), OPERATORS),
+    **dict.fromkeys(
+        ("b", "lower", "upper", "mu", "coefficients", "patch_radius", "rolling"), OPERATORS
+    ),
     "A": ("matrix",),
     **dict.fromkeys(("target", "v_free", "compliance", "J"), ("rows", "generalized")),
     "M": ("generalized",),
@@ -121,14 +123,13 @@ class Gradient(GradientArrays):
         M: sp.csr_array
 
     def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
-        m, end = derivative.m, len(adjoint) - derivative.m
+        m = derivative.m
+        end = len(adjoint) - derivative.m
         # q, s (m), f = y - J^T s (nv) and c (m) of equation (4) in `lavender.gradient`.
-        self._q, self._s, self._f, self._c = (
-            adjoint[:m],
-            adjoint[m : 2 * m],
-            adjoint[2 * m : end],
-            adjoint[end:],
-        )
+        self._q = adjoint[:m]
+        self._s = adjoint[m : 2 * m]
+        self._f = adjoint[2 * m : end]
+        self._c = adjoint[end:]
         self._derivative = derivative
 
     @cached_property
@@ -141,13 +142,16 @@ class Gradient(GradientArrays):
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self._derivative.inputs]
 
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
+    if (
+        not TYPE_CHECKING
+    ):  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             """Compute the gradient by one input, and store it as an attribute."""
             if name not in INPUTS:
                 raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
-            derivative, operators = self._derivative, INPUTS[name]
+            derivative = self._derivative
+            operators = INPUTS[name]
             if derivative.problem.operator not in operators:
                 raise CapabilityError(
                     f"{name} exists only for problems given as {' or '.join(operators)}, and this one was given as "
@@ -162,7 +166,8 @@ class Gradient(GradientArrays):
 
     def _compute(self, name: str) -> Any:
         """Compute the gradient by one input: (5) of `lavender.gradient`."""
-        derivative, problem = self._derivative, self._derivative.problem
+        derivative = self._derivative
+        problem = self._derivative.problem
         if name in ("b", "target"):
             return self._s
         if name == "v_free":
@@ -216,7 +221,8 @@ class Gradient(GradientArrays):
         if derivative.problem.cones.has_ellipse:
             rows, dz_de, dy_de = derivative._ellipse_terms
             e[rows] = (
-                dz_de * self._q[rows] - dy_de * linear.multiply_projection_derivative(self._q, True)[rows]
+                dz_de * self._q[rows]
+                - dy_de * linear.multiply_projection_derivative(self._q, True)[rows]
             )
         return e
 
@@ -227,7 +233,8 @@ class Gradient(GradientArrays):
             return [(-self._s, derivative._impulse)]
         if name == "J":
             return [(derivative._impulse, self._p), (-self._s, derivative._velocity)]
-        change, half = derivative._velocity_change, -0.5 * self._p
+        change = derivative._velocity_change
+        half = -0.5 * self._p
         return [(half, change), (-0.5 * change, self._p)]
 
     def full(self, name: str) -> FloatArray:

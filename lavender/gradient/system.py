@@ -28,7 +28,9 @@ MAX_PROXIMAL_STEPS = 8
 # The iteration (6) ends if a step changes x by up to this fraction of its largest entry.
 MIN_PROXIMAL_CHANGE = 1e-14
 NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
-MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
+MAX_KERNEL_ROWS = (
+    64  # Systems of up to this many rows are factored as dense matrices by the kernel.
+)
 # Larger systems of up to this many rows are factored as dense matrices if a contact slides, or if A is not symmetric.
 MAX_DENSE_ROWS = 400
 
@@ -55,19 +57,27 @@ class System:
     """
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
-        self.problem, self.linear, self.n = problem, linear, linear.rows
-        is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.has_sliding_contact and problem.is_symmetric
+        self.problem = problem
+        self.linear = linear
+        self.n = linear.rows
+        is_symmetric = (
+            self.n > MAX_KERNEL_ROWS and not linear.has_sliding_contact and problem.is_symmetric
+        )
         if is_symmetric and not is_dense_factor_faster(problem.csr.nnz, problem.m, True):
             factor = self._factor_symmetric
         else:
             factor = self._factor_dense if self.n <= MAX_DENSE_ROWS else self._factor_lu
         # For systems of up to MAX_KERNEL_ROWS rows, `Derivative` has called `factor_dense` before.
         is_factored = self.n <= MAX_KERNEL_ROWS
-        solve = linear.solve if is_factored and linear.regular else None if is_factored else factor(0.0)
+        solve = (
+            linear.solve if is_factored and linear.regular else None if is_factored else factor(0.0)
+        )
         self.singular = solve is None
         self.of_kernel = solve is not None and factor == self._factor_dense
         if solve is None:
-            self.g: Any = linear.matrix() if factor == self._factor_dense else self._form_matrix(0.0)
+            self.g: Any = (
+                linear.matrix() if factor == self._factor_dense else self._form_matrix(0.0)
+            )
             solve = factor(SHIFT_OF_SINGULAR)
         if solve is None:
             raise CapabilityError(
@@ -82,8 +92,11 @@ class System:
 
     def _form_h(self) -> tuple[Any, Any, FloatArray]:
         """Form H on the rows of the system; return the arrays of its compressed rows."""
-        a, linear = self.problem.csr, self.linear
-        indptr, indices, data = extract_free_part(a.indptr, a.indices, a.data, linear.system_row, self.n)
+        a = self.problem.csr
+        linear = self.linear
+        indptr, indices, data = extract_free_part(
+            a.indptr, a.indices, a.data, linear.system_row, self.n
+        )
         root = linear.root[linear.system_row >= 0]
         return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
 
@@ -98,7 +111,8 @@ class System:
         """Form G + shift P = I - P + P (H + shift I) as a sparse matrix."""
         indptr, indices, data = self._form_h()
         h = sp.csr_array((data, indices, indptr), shape=(self.n, self.n))
-        c, one = self.problem.cones, sp.eye_array(self.n)
+        c = self.problem.cones
+        one = sp.eye_array(self.n)
         block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
         is_row = ~c.is_contact[block]
         # P has one diagonal entry for a bounded row, and a dense block for a contact.
@@ -138,7 +152,8 @@ class System:
             return self._null_vectors[transpose]
         if not self.singular:
             return np.zeros((0, self.n))
-        g, vectors = (self.g.T if transpose else self.g), []
+        g = self.g.T if transpose else self.g
+        vectors = []
         for x in np.random.default_rng(0).standard_normal((NULL_VECTORS, self.n)):
             for _ in range(MAX_PROXIMAL_STEPS):
                 x = x - self._solve_factored(g @ x, transpose)

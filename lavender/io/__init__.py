@@ -37,11 +37,33 @@ from lavender.io.velocities import Reconstruction, reconstruct
 from lavender.problem import Problem
 
 __all__ = [
-    "Claims", "EngineStep", "MujocoScratch", "Reconstruction", "Recorder", "Recording", "StepVerdict", "Stored",
-    "drake", "efc", "from_drake", "from_efc", "from_genesis", "from_kamino", "from_mujoco", "from_mujoco_many",
-    "from_newton_mujoco", "from_pinocchio", "load", "load_solution", "mujoco", "read", "read_recorded_state",
-    "reconstruct", "record", "save",
-]  # fmt: skip
+    "Claims",
+    "EngineStep",
+    "MujocoScratch",
+    "Reconstruction",
+    "Recorder",
+    "Recording",
+    "StepVerdict",
+    "Stored",
+    "drake",
+    "efc",
+    "from_drake",
+    "from_efc",
+    "from_genesis",
+    "from_kamino",
+    "from_mujoco",
+    "from_mujoco_many",
+    "from_newton_mujoco",
+    "from_pinocchio",
+    "load",
+    "load_solution",
+    "mujoco",
+    "read",
+    "read_recorded_state",
+    "reconstruct",
+    "record",
+    "save",
+]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 
@@ -86,7 +108,11 @@ def load_solution(path: str | os.PathLike[str]) -> FloatArray | None:
 
 
 def save(
-    problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, drop: Collection[str] = ()
+    problem: Problem,
+    path: str | os.PathLike[str],
+    *,
+    impulse: Any = None,
+    drop: Collection[str] = (),
 ) -> None:
     """Write a problem; the suffix selects the format. An existing file is replaced atomically.
 
@@ -108,13 +134,18 @@ def save(
     CapabilityError
         The format cannot hold something of this problem; the message names it.
     """
-    path, drop = as_path(path), check_sequence("drop", drop, "names")
+    path = as_path(path)
+    drop = check_sequence("drop", drop, "names")
     suffix = path.suffix.lower()
     if suffix == ".npz":
         if drop:
-            raise InputError("drop= has no effect on an .npz file, which holds everything: leave it out")
+            raise InputError(
+                "drop= has no effect on an .npz file, which holds everything: leave it out"
+            )
         write_npz(problem, path, impulse=impulse)
     elif suffix in HDF5:
         fclib.write(problem, path, impulse=impulse, drop=drop)
     else:
-        raise InputError(f"{path} ends with {suffix!r}; .npz or .hdf5 is needed, which selects the format")
+        raise InputError(
+            f"{path} ends with {suffix!r}; .npz or .hdf5 is needed, which selects the format"
+        )

@@ -90,7 +90,9 @@ def _convert_contact_problem(plant: Any, context: Any, *options: Any) -> tuple[P
         from pydrake.multibody.plant import MultibodyPlant_
         from pydrake.systems.framework import Context_
     except ImportError:
-        raise InputError("pydrake cannot be imported: pip install drake, which provides plants") from None
+        raise InputError(
+            "pydrake cannot be imported: pip install drake, which provides plants"
+        ) from None
     if not isinstance(plant, MultibodyPlant_[float]) or not isinstance(context, Context_[float]):
         raise InputError(
             f"got a {type(plant).__name__} and a {type(context).__name__}; a MultibodyPlant and its Context are needed"
@@ -108,7 +110,9 @@ def _build_problem(
     """Build the problem and SAP's impulses (m,) [N s]; raise an error for a plant that cannot be converted."""
     step = float(plant.time_step())
     if not step > 0.0:
-        raise InputError("the plant is continuous; a time step is needed: MultibodyPlant(time_step=dt)")
+        raise InputError(
+            "the plant is continuous; a time step is needed: MultibodyPlant(time_step=dt)"
+        )
     dt = step if dt is None else check_float("dt", dt)
     if not math.isclose(dt, step, rel_tol=1e-12):
         raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be equal")
@@ -120,27 +124,44 @@ def _build_problem(
         )
     # Drake leaves out the velocities of locked joints, and crashes the process if their bodies have contacts.
     joints = list_joints(plant)
-    locked = [joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)]
+    locked = [
+        joint.name() for joint in joints if joint.num_velocities() and joint.is_locked(context)
+    ]
     if locked:
-        raise CapabilityError(f"the joints {', '.join(locked):.200} are locked; welds are supported")
+        raise CapabilityError(
+            f"the joints {', '.join(locked):.200} are locked; welds are supported"
+        )
     dynamics, v_free = compute_free_motion(plant, context, dt)
     contacts = _read_contacts(plant, context)
     limits = _read_joint_limits(plant, context)
     nv = int(plant.num_velocities())
     jac = np.concatenate([np.zeros((0, nv)), *(c.jac for c in contacts), *(x.jac for x in limits)])
-    gaps = [compute_target_velocity(np.array([-c.depth, 0.0, 0.0]), dt, correction) for c in contacts]
+    gaps = [
+        compute_target_velocity(np.array([-c.depth, 0.0, 0.0]), dt, correction) for c in contacts
+    ]
     gaps += [compute_target_velocity(np.array([x.gap]), dt, correction) for x in limits]
     cones = Cones.contacts(np.array([c.mu for c in contacts])) if contacts else Cones.free(0)
     if limits:
         cones = cones + Cones.bounded(np.zeros(len(limits)), np.full(len(limits), np.inf))
-    impulses = np.concatenate([np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))])
-    _complete_impulses(plant, context, dynamics, v_free, jac, impulses, limits, 3 * len(contacts), dt)
+    impulses = np.concatenate(
+        [np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))]
+    )
+    _complete_impulses(
+        plant, context, dynamics, v_free, jac, impulses, limits, 3 * len(contacts), dt
+    )
     problem = Problem.from_jacobian(
-        jac, dynamics, v_free, target=np.concatenate([np.zeros(0), *gaps]), cones=cones, compliance=compliance,
-        friction=friction, names=[c.name for c in contacts] + [x.name for x in limits],
+        jac,
+        dynamics,
+        v_free,
+        target=np.concatenate([np.zeros(0), *gaps]),
+        cones=cones,
+        compliance=compliance,
+        friction=friction,
+        names=[c.name for c in contacts] + [x.name for x in limits],
         angular=[False] * (3 * len(contacts)) + [x.is_angular for x in limits],
-        dof_names=list(plant.GetVelocityNames(always_add_suffix=True)), name=name,
-    )  # fmt: skip
+        dof_names=list(plant.GetVelocityNames(always_add_suffix=True)),
+        name=name,
+    )
     return problem, impulses
 
 
@@ -232,7 +253,8 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
             f"there are {results.num_hydroelastic_contacts()} hydroelastic contacts; only point contacts are supported"
         )
     inspector = port.Eval(context).inspector()
-    world, contacts = plant.world_frame(), []
+    world = plant.world_frame()
+    contacts = []
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
         pair = info.point_pair()
@@ -243,13 +265,19 @@ def _read_contacts(plant: Any, context: Any) -> list[_Contact]:
         axes = np.stack([normal, first, np.cross(normal, first)])
         jac = [
             plant.CalcJacobianTranslationalVelocity(
-                context, JacobianWrtVariable.kV, body.body_frame(),
-                plant.EvalBodyPoseInWorld(context, body).inverse() @ info.contact_point(), world, world,
+                context,
+                JacobianWrtVariable.kV,
+                body.body_frame(),
+                plant.EvalBodyPoseInWorld(context, body).inverse() @ info.contact_point(),
+                world,
+                world,
             )
             for body in bodies
-        ]  # fmt: skip
+        ]
         mu = [
-            inspector.GetProximityProperties(x).GetProperty("material", "coulomb_friction").dynamic_friction()
+            inspector.GetProximityProperties(x)
+            .GetProperty("material", "coulomb_friction")
+            .dynamic_friction()
             for x in (pair.id_A, pair.id_B)
         ]
         contacts.append(
@@ -271,14 +299,17 @@ def _read_joint_limits(plant: Any, context: Any) -> list[_Limit]:
     for joint in list_joints(plant):
         if joint.num_velocities() != 1 or joint.num_positions() != 1:
             continue
-        velocity, is_angular = joint.velocity_start(), joint.type_name() == "revolute"
+        velocity = joint.velocity_start()
+        is_angular = joint.type_name() == "revolute"
         q = float(plant.GetPositions(context)[joint.position_start()])
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         for word, sign, gap in (("lower", 1.0, q - low), ("upper", -1.0, high - q)):
             if math.isfinite(gap):
                 row = np.zeros((1, nv))
                 row[0, velocity] = sign
-                limits.append(_Limit(f"{joint.name()} {word}", row, gap, velocity, sign, is_angular))
+                limits.append(
+                    _Limit(f"{joint.name()} {word}", row, gap, velocity, sign, is_angular)
+                )
     return limits
 
 
@@ -313,7 +344,9 @@ def _complete_impulses(
             impulses[first_limit_row + k] = limit.sign * momentum_error[i]
             momentum_error[i] = 0.0
     weight = 1.0 / np.sqrt(np.diag(dynamics))  # SAP uses these weights in its stopping test.
-    if not np.linalg.norm(weight * momentum_error) <= MOMENTUM_TOLERANCE * np.linalg.norm(weight * size):
+    if not np.linalg.norm(weight * momentum_error) <= MOMENTUM_TOLERANCE * np.linalg.norm(
+        weight * size
+    ):
         worst = int(np.argmax(weight * np.abs(momentum_error)))
         raise CapabilityError(
             "a force that the import does not read acts on the plant: A (v+ - v*) and J^T times the impulses "

@@ -47,8 +47,15 @@ from lavender_ext.io.mujoco_rows import copy_rows, copy_state, join_worlds
 
 # Values of mjtConstraint: equality; friction loss of a joint and of a tendon; elliptic contact, the largest value.
 # Rows of all other types have impulses >= 0.
-EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
-ONE_SIDED = (3, 4, 5, 6)  # Limits of joints and tendons, contacts without friction, edges of pyramids.
+EQUALITY = 0
+FRICTION = (1, 2)
+ELLIPTIC = 7
+ONE_SIDED = (
+    3,
+    4,
+    5,
+    6,
+)  # Limits of joints and tendons, contacts without friction, edges of pyramids.
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
 CHUNK_ENTRIES = 2**21  # Number of entries of J that are converted to float64 at a time.
 # Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
@@ -192,7 +199,9 @@ def from_efc(
     free = before + dt * smooth
     step = max(1, CHUNK_ENTRIES // max(1, m * nv))
     for i in range(0, n, step):
-        target[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
+        target[i : i + step] += np.einsum(
+            "nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step]
+        )
     compliance = np.where(used_rows, 1.0 / inv_compliance, 0.0)
     cones, scale = _make_blocks(row_type, loss, used_rows, contacts, dt)
     if friction == "coulomb" and (scale is not None or cones.has_round):
@@ -202,11 +211,19 @@ def from_efc(
         )
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
-        target, compliance = target * scale, compliance * scale * scale
+        target = target * scale
+        compliance = compliance * scale * scale
 
     def make_batch(soft: FloatArray) -> Batch:
         batch = Batch(
-            jac, mass, free, target=target, cones=cones, compliance=soft, friction=friction, count=count
+            jac,
+            mass,
+            free,
+            target=target,
+            cones=cones,
+            compliance=soft,
+            friction=friction,
+            count=count,
         )
         batch.precision = precision
         return batch
@@ -214,7 +231,8 @@ def from_efc(
     if efc_force is None:
         return Imported(make_engine_batch(make_batch, compliance), None)
     force = as_array("efc_force", efc_force, (n, m), finite=False)
-    lam, change = np.where(used_rows, dt * force, 0.0), None
+    lam = np.where(used_rows, dt * force, 0.0)
+    change = None
     lam = lam if scale is None else lam / scale
     if qacc is not None:
         acceleration = as_array("qacc", qacc, (n, nv), finite=False)
@@ -248,7 +266,9 @@ class MujocoScratch:
             raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
         self.model = model
         self._sizes = b""
-        self._kept: list[Any] = []  # Not more than one MjData, which a call takes out while it uses it.
+        self._kept: list[
+            Any
+        ] = []  # Not more than one MjData, which a call takes out while it uses it.
 
     def take_data(self) -> Any:
         """Return an MjData as after its creation, to be given back by `keep_data`."""
@@ -270,9 +290,14 @@ class MujocoScratch:
 
 
 def from_mujoco_many(
-    model: Any, states: Any, *, threads: int = 1, errors: str = "raise", scratch: MujocoScratch | None = None,
+    model: Any,
+    states: Any,
+    *,
+    threads: int = 1,
+    errors: str = "raise",
+    scratch: MujocoScratch | None = None,
     velocity: Any = None,
-) -> Imported:  # fmt: skip
+) -> Imported:
     """Call `mj_forward` on many states of one MuJoCo model; return the problems and MuJoCo's own answers.
 
     A model with <flag sleep="enable"/> is rejected: a state does not contain which trees sleep, so that MuJoCo would
@@ -323,7 +348,9 @@ def from_mujoco_many(
             "and in the simulation: model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
         )
     check_choice("errors", errors, ERRORS)
-    values = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
+    values = np.ascontiguousarray(
+        as_array("states", states, (None, None), finite=errors == "raise")
+    )
     size = values.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}
     for kind in (mj.mjtState.mjSTATE_FULLPHYSICS, mj.mjtState.mjSTATE_INTEGRATION):
@@ -333,10 +360,16 @@ def from_mujoco_many(
             f"each state has {size} numbers; one of {sorted(kinds)} is needed, as of mjSTATE_PHYSICS"
         )
     if velocity is not None and kinds[size] != mj.mjtState.mjSTATE_INTEGRATION:
-        raise InputError(f"velocity was given with states of {size} numbers; mjSTATE_INTEGRATION is needed")
-    n, nv, dt = len(values), model.nv, float(model.opt.timestep)
+        raise InputError(
+            f"velocity was given with states of {size} numbers; mjSTATE_INTEGRATION is needed"
+        )
+    n = len(values)
+    nv = model.nv
+    dt = float(model.opt.timestep)
     # v, a0, a and dt J^T f of each state, and the entries of M.
-    moves, mass, mover = np.zeros((n, 4, nv)), np.zeros((n, len(model.M_colind))), ""
+    moves = np.zeros((n, 4, nv))
+    mass = np.zeros((n, len(model.M_colind)))
+    mover = ""
     # Matrices of the integrator "discrete", which may have other patterns.
     matrices: dict[int, Compressed] = {}
     # J, numbers of rows, number of contacts, and blocks of each finite state.
@@ -353,7 +386,8 @@ def from_mujoco_many(
             "with threads=1"
         )
 
-    has_moving_surfaces, kind = bool(getattr(model, "flg_surfacevel", 0)), int(kinds[size])
+    has_moving_surfaces = bool(getattr(model, "flg_surfacevel", 0))
+    kind = int(kinds[size])
 
     def work(stop: bytearray) -> Any:
         nonlocal mover
@@ -409,10 +443,14 @@ def from_mujoco_many(
     if matrices:
         mass, indices, indptr = _merge_lower_triangles(matrices, mass, indices, indptr)
     blocks_of_states = [None if rows is None else rows[3] for rows in rows_of_states]
-    cones = Cones._from_blocks(concatenate_blocks([each for each in blocks_of_states if each is not None]))
+    cones = Cones._from_blocks(
+        concatenate_blocks([each for each in blocks_of_states if each is not None])
+    )
 
     def make_batch(soft: FloatArray) -> Batch:
-        return Batch._from_valid_rows(jac, mass, (indptr, indices), free, target, soft, cones, places)
+        return Batch._from_valid_rows(
+            jac, mass, (indptr, indices), free, target, soft, cones, places
+        )
 
     answer = None if model.opt.noslip_iterations else change
     batch = make_engine_batch(make_batch, compliance, lam, answer, mover, moves[:, 3])
@@ -420,12 +458,20 @@ def from_mujoco_many(
     def name_blocks_of_world(i: int) -> Any:
         blocks = blocks_of_states[i]
         m = 0 if blocks is None else blocks.n_rows
-        return [] if blocks is None else single.make_block_names(mj, model, blocks.ints[2 * m + 1 :], m, 1)
+        return (
+            []
+            if blocks is None
+            else single.make_block_names(mj, model, blocks.ints[2 * m + 1 :], m, 1)
+        )
 
     def find_angular_rows_of_world(i: int) -> Any:
         blocks = blocks_of_states[i]
         m = 0 if blocks is None else blocks.n_rows
-        return None if blocks is None else single.find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m)
+        return (
+            None
+            if blocks is None
+            else single.find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m)
+        )
 
     batch.names_of, batch.angular_of = name_blocks_of_world, find_angular_rows_of_world
     batch.contact_counts = contact_counts
@@ -506,7 +552,8 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
             f"values of M have shape {values.shape}; ({n}, entries) is needed, a row for a world"
         )
     ptr, col = check_shared_lower_triangles(pattern, np.full(n, nv), values)
-    row, full = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
+    row = np.repeat(np.arange(nv), np.diff(ptr))
+    full = np.zeros((n, nv, nv), values.dtype)
     full[:, row, col] = values
     full[:, col, row] = values
     return full
@@ -515,7 +562,9 @@ def _convert_mass(values: Any, n: int, nv: int) -> Any:
 def _find_elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     """Return world, first row, rows and coefficients of each contact that begins at a row of `elliptic` (n, m)."""
     if not isinstance(contacts, (tuple, list)) or len(contacts) != 4:
-        raise InputError(f"contacts is {contacts!r:.60}; (world, efc_address, dim, friction) is needed")
+        raise InputError(
+            f"contacts is {contacts!r:.60}; (world, efc_address, dim, friction) is needed"
+        )
     names = [f"{name} of contacts" for name in ("world", "efc_address", "dim")]
     size = (get_shape(names[0], contacts[0]) or (None,))[0]
     world, address, dim = (
@@ -560,14 +609,19 @@ def _make_blocks(
 ) -> tuple[Cones, FloatArray | None]:
     """Return the blocks of all used rows, world after world, and the factor of each row (n, m) or None if all are 1."""
     n, m = row_type.shape
-    begins, tangents, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
+    begins = np.ones((n, m), bool)
+    tangents = np.zeros((n, m), np.int32)
+    mu = np.zeros((n, m))
     scale = None
     elliptic = (row_type == ELLIPTIC) & used_rows
     if elliptic.any() and contacts is None:
-        raise InputError("efc_type has rows of elliptic contacts; contacts= is needed, with their friction")
+        raise InputError(
+            "efc_type has rows of elliptic contacts; contacts= is needed, with their friction"
+        )
     if contacts is not None:
         world, address, dim, rub = _find_elliptic_contacts(contacts, elliptic)
-        tangents[world, address], mu[world, address] = dim - 1, rub[:, 0]
+        tangents[world, address] = dim - 1
+        mu[world, address] = rub[:, 0]
         factor = np.ones((n, m))
         for j in range(1, int(np.max(dim, initial=1))):
             at = dim > j

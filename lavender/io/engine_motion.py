@@ -35,8 +35,12 @@ from lavender.solving.solve import solve
 MOVERS = ("acceleration", "forces")
 # [-] If R / d of all rows is larger, forces keep 11 of 16 digits.
 MAX_STIFF_RATIO = 1e-5
-MAX_MOTION_ENTRIES = 1_000_000  # Entries of J above which the dense QR factorisation of (2) takes seconds.
-MAX_BOUNDARY_ROUNDOFFS = 32.0  # [unit round-offs] Friction within this part of its bound is on the boundary.
+MAX_MOTION_ENTRIES = (
+    1_000_000  # Entries of J above which the dense QR factorisation of (2) takes seconds.
+)
+MAX_BOUNDARY_ROUNDOFFS = (
+    32.0  # [unit round-offs] Friction within this part of its bound is on the boundary.
+)
 ROUNDOFF_OF_PRECISION = {"float64": 2.0**-53, "float32": 2.0**-24}
 # [-] Relative residual of the solution in (1), which is below the rounding of most problems.
 EXACT_TOL = 1e-12
@@ -61,7 +65,9 @@ class EngineMotion:
     def judge(self, problem: Problem, forces: Residual) -> Residual:
         """Return the residual of the forces (`forces`) or of the acceleration, by `moved_by`."""
         general = problem.generalized
-        if general is None or not (np.isfinite(self.impulse).all() and np.isfinite(self.change).all()):
+        if general is None or not (
+            np.isfinite(self.impulse).all() and np.isfinite(self.change).all()
+        ):
             return forces
         rigid = np.where(problem.d > 0.0, problem.d, np.inf)
         ratio = float(np.min(self.compliance / rigid, where=self.compliance > 0.0, initial=1.0))
@@ -72,32 +78,51 @@ class EngineMotion:
             for solver in SOLVERS:
                 solution = solve(problem, solver, tol=EXACT_TOL, impulse=self.impulse)
                 own = solution.residual
-                if own.relative <= EXACT_TOL or own.velocity <= MAX_SOLUTION_ERROR * forces.velocity:
+                if (
+                    own.relative <= EXACT_TOL
+                    or own.velocity <= MAX_SOLUTION_ERROR * forces.velocity
+                ):
                     break
             else:
                 return forces
             delta = self.change - general.change(solution.impulse)
             rounding = self._estimate_rounding(problem) + own.velocity_by_row
             return _make_velocity_error(problem, forces, general.velocity_of(delta), rounding)
-        digits, found = float(-np.log10(ratio)), forces
+        digits = float(-np.log10(ratio))
+        found = forces
         boundary = _find_boundary_normals(problem, self.impulse)
         # The step (2) is not possible if M is not positive definite to rounding.
         with contextlib.suppress(np.linalg.LinAlgError):
-            step = _compute_newton_step(problem, self.compliance, self.impulse, self.change, boundary)
-            slack = general.velocity_of(self.change) - problem.b + self.compliance * self.impulse - step[1]
+            step = _compute_newton_step(
+                problem, self.compliance, self.impulse, self.change, boundary
+            )
+            slack = (
+                general.velocity_of(self.change)
+                - problem.b
+                + self.compliance * self.impulse
+                - step[1]
+            )
             error = _compute_error(problem, self.impulse, step[0], slack, boundary)
-            rounding = self._estimate_rounding(problem) / np.where(problem.d > 0.0, problem.d, np.inf)
+            rounding = self._estimate_rounding(problem) / np.where(
+                problem.d > 0.0, problem.d, np.inf
+            )
             by_step = replace_error(forces, problem, error, rounding)
             found = by_step if by_step.velocity < forces.velocity else forces
         if self.moved_by == "acceleration":
             return replace(found, lost_digits=digits)
         # The raised compliances of the problem do not belong to these forces: compare motions.
-        used = general.change(self.impulse) if self.momentum is None else general.solve(self.momentum)
+        used = (
+            general.change(self.impulse) if self.momentum is None else general.solve(self.momentum)
+        )
         rounding = self._estimate_rounding(problem) + np.abs(found.velocity_by_row)
-        moved = _make_velocity_error(problem, forces, general.velocity_of(used - self.change), rounding)
+        moved = _make_velocity_error(
+            problem, forces, general.velocity_of(used - self.change), rounding
+        )
         if not found.velocity < MAX_SOLUTION_ERROR * moved.velocity:
             return replace(forces, lost_digits=digits)
-        return replace(moved, moved_by="impulse", lost_digits=digits, acceleration_error=found.velocity)
+        return replace(
+            moved, moved_by="impulse", lost_digits=digits, acceleration_error=found.velocity
+        )
 
     def _estimate_rounding(self, problem: Problem) -> FloatArray:
         """Return the rounding of the slack of each row (m,) [m/s]."""
@@ -112,7 +137,9 @@ class EngineMotion:
         moved = moved if general.order is None else moved[general.order]
         indptr, columns, entries = general.operator.jac  # A sparse array would import SciPy.
         rows = np.repeat(np.arange(problem.m), np.diff(indptr))
-        of_jacobian = np.bincount(rows, weights=np.abs(entries) * moved[columns], minlength=problem.m)
+        of_jacobian = np.bincount(
+            rows, weights=np.abs(entries) * moved[columns], minlength=problem.m
+        )
         terms: FloatArray = of_jacobian + np.abs(problem.b) + self.compliance * np.abs(self.impulse)
         return ROUNDOFF_OF_PRECISION[problem.precision] * terms
 
@@ -125,17 +152,24 @@ def _make_velocity_error(
     return replace_error(forces, problem, error / weight, rounding / weight)
 
 
-def _find_boundary_normals(problem: Problem, impulse: FloatArray) -> dict[int, tuple[IntArray, FloatArray]]:
+def _find_boundary_normals(
+    problem: Problem, impulse: FloatArray
+) -> dict[int, tuple[IntArray, FloatArray]]:
     """Return rows and outward normal of each friction component at its bound, by the component's first friction row."""
-    cones, found = problem.cones, {}
+    cones = problem.cones
+    found = {}
     margin = MAX_BOUNDARY_ROUNDOFFS * ROUNDOFF_OF_PRECISION[problem.precision]
     for block, rows in cones.friction_components():
-        first, mu = cones.ptr[block], float(cones.friction_coefficient[rows[0]])
-        size, bound = float(np.linalg.norm(impulse[rows])), mu * float(impulse[first])
+        first = cones.ptr[block]
+        mu = float(cones.friction_coefficient[rows[0]])
+        size = float(np.linalg.norm(impulse[rows]))
+        bound = mu * float(impulse[first])
         if size >= (1.0 - margin) * bound:
-            outward, own = impulse[rows] / size if size > 0.0 else np.zeros(len(rows)), rows
+            outward = impulse[rows] / size if size > 0.0 else np.zeros(len(rows))
+            own = rows
             if problem.friction == "cone":
-                own, outward = np.append(first, rows), np.append(-mu, outward)
+                own = np.append(first, rows)
+                outward = np.append(-mu, outward)
             found[int(rows[0])] = own, outward
     return found
 
@@ -172,7 +206,8 @@ def _compute_newton_step(
     # Householder's QR of rows in descending order keeps the digits of each row, whatever the weights are.
     order = np.argsort(-np.abs(stacked).max(axis=1), kind="stable")
     upper, pivots = qr(stacked[order], mode="r", pivoting=True)
-    upper, step = upper[: general.nv], np.zeros(general.nv)
+    upper = upper[: general.nv]
+    step = np.zeros(general.nv)
     step[pivots] = solve_triangular(upper, solve_triangular(upper, missing[pivots], trans="T"))
     moved = general.velocity_of(step)
     delta = np.where(inside, -moved / np.where(inside, compliance, 1.0), 0.0)
@@ -189,14 +224,17 @@ def _compute_error(
     boundary: dict[int, tuple[IntArray, FloatArray]],
 ) -> FloatArray:
     """Return the error e (m,) [N s] of the impulses `impulse` + `delta` with this slack, without cancellation."""
-    cones, d, is_cone = problem.cones, problem.d.copy(), problem.friction == "cone"
+    cones = problem.cones
+    d = problem.d.copy()
+    is_cone = problem.friction == "cone"
     for _, rows in cones.friction_components():
         d[rows] = d[rows].mean()
     step = slack / np.where(d > 0.0, d, np.inf)
     low, high = impulse - cones.lower, impulse - cones.upper  # inf and -inf without bounds.
     error = np.clip(step, high + delta, low + delta)
     for block, rows in cones.friction_components():
-        first, mu = cones.ptr[block], float(cones.friction_coefficient[rows[0]])
+        first = cones.ptr[block]
+        mu = float(cones.friction_coefficient[rows[0]])
         own = np.append(first, rows) if is_cone else rows
         error[own] = step[own]
         if impulse[first] + delta[first] <= 0.0:
@@ -206,13 +244,16 @@ def _compute_error(
             # Project the impulse -step on the friction cone in the metric of d.
             root = np.sqrt(d[own])
             y = -root * step[own]
-            slope, size = mu * root[1] / root[0], float(np.linalg.norm(y[1:]))
+            slope = mu * root[1] / root[0]
+            size = float(np.linalg.norm(y[1:]))
             if size > slope * y[0]:
                 length = max(0.0, (float(y[0]) + slope * size) / (1.0 + slope * slope))
                 error[own] = -np.append(length, y[1:] * (slope * length / size)) / root
         elif int(rows[0]) in boundary:
             outward = boundary[int(rows[0])][1]
-            if outward @ step[own] < 0.0:  # The update leaves the set and is projected on its boundary.
+            if (
+                outward @ step[own] < 0.0
+            ):  # The update leaves the set and is projected on its boundary.
                 normal = outward / d[own]
                 error[own] -= normal * float(outward @ step[own]) / float(outward @ normal)
     return error

@@ -38,7 +38,9 @@ PARTS = {
     LOCAL: {"W": "mm", "V": "mp", "R": "pp", "q": "m", "s": "p", "mu": "c", "mu_r": "c"},
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
-DENSE_CHUNK_NUMBERS = 2**23  # At most this many entries of M^-1 J^T or A are held densely at a time (64 MiB).
+DENSE_CHUNK_NUMBERS = (
+    2**23
+)  # At most this many entries of M^-1 J^T or A are held densely at a time (64 MiB).
 # Factors of M with more entries than this (in dense storage) are not computed: 2 GiB of values and indices.
 MAX_MASS_FACTOR_ENTRIES = 2**27
 
@@ -54,18 +56,24 @@ class Contents(NamedTuple):
     solution: Mapping[str, FloatArray] = MappingProxyType({})
     guesses: Sequence[Mapping[str, FloatArray]] = ()
     info: Mapping[str, str] = MappingProxyType({})  # dict of str to str
-    compare: str = ""  # Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
+    compare: str = (
+        ""  # Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
+    )
 
     def build_problem(self, name: str = "") -> Problem:
         """Return the problem.
 
         A global problem is returned in generalised coordinates (J = H^T), or as A and b if M is not a mass matrix.
         """
-        x, a, general = self.parts, None, None
+        x = self.parts
+        a = None
+        general = None
         if self.group.startswith(LOCAL):
-            a, b = x["W"], -x["q"]
+            a = x["W"]
+            b = -x["q"]
             if "s" in x:
-                a, b = sp.csr_array(sp.block_array([[a, x["V"]], [x["V"].T, x["R"]]])), np.append(b, -x["s"])
+                a = sp.csr_array(sp.block_array([[a, x["V"]], [x["V"].T, x["R"]]]))
+                b = np.append(b, -x["s"])
         else:
             # The rows of J = [H G]^T are the contact rows and the equations.
             jt = sp.csr_array(sp.hstack([x["H"], x["G"]])) if "G" in x else x["H"]
@@ -74,23 +82,30 @@ class Contents(NamedTuple):
             if general is not None:
                 b = general.bias(-offset)
             elif x["M"].shape[0] == 0:
-                a, b = sp.csr_array((len(offset), len(offset))), -offset
+                a = sp.csr_array((len(offset), len(offset)))
+                b = -offset
             else:
                 a, free_velocity = form_dense_a(x["M"], jt, x["f"])
                 b = -(offset + free_velocity)
-        mu, mu_r, d = x["mu"], x.get("mu_r"), self.spacedim
+        mu = x["mu"]
+        mu_r = x.get("mu_r")
+        d = self.spacedim
         cones = Cones.contacts(mu, d - 1 if mu_r is None else 2, rolling=mu_r) + Cones.free(
             len(b) - len(mu) * d
         )
         guess = _join_impulse(self.guesses[0]) if self.guesses else None
-        return Problem(b, cones, a, guess=guess, name=self.info.get("title", "") or name, generalized=general)
+        return Problem(
+            b, cones, a, guess=guess, name=self.info.get("title", "") or name, generalized=general
+        )
 
 
 def _join_impulse(point: Mapping[str, FloatArray]) -> FloatArray:
     return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
 
-def _build_generalised_form(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> Generalized | None:
+def _build_generalised_form(
+    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray
+) -> Generalized | None:
     """Return the generalised form, or None if M (n, n) is not a mass matrix of bodies.
 
     M does not count as a mass matrix if it is asymmetric or not positive definite, or if a connected component of it is
@@ -113,11 +128,15 @@ def _bound_factor_entries(mass: sp.csr_array) -> float:
     return float(size @ size)
 
 
-def form_dense_a(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> tuple[sp.csr_array, FloatArray]:
+def form_dense_a(
+    mass: sp.csr_array, jt: sp.csr_array, f: FloatArray
+) -> tuple[sp.csr_array, FloatArray]:
     """Return A = J M^-1 J^T (m, m) and J M^-1 f (m,) for M (n, n), J^T (n, m) and f (n,)."""
     entries = _bound_factor_entries(mass)
     if entries > MAX_MASS_FACTOR_ENTRIES:
-        raise InputError(f"the factors of M may have {entries:.3g} entries, above {MAX_MASS_FACTOR_ENTRIES}")
+        raise InputError(
+            f"the factors of M may have {entries:.3g} entries, above {MAX_MASS_FACTOR_ENTRIES}"
+        )
     try:
         solve = factor_sparse_lu(mass).solve
     except RuntimeError as error:
@@ -126,7 +145,10 @@ def form_dense_a(mass: sp.csr_array, jt: sp.csr_array, f: FloatArray) -> tuple[s
     step = max(1, DENSE_CHUNK_NUMBERS // max(1, *jt.shape))
     columns = sp.csc_array(jt)
     j = sp.csr_array(jt.T)
-    parts = [sp.csr_array(j @ solve(columns[:, k : min(k + step, m)].toarray())) for k in range(0, m, step)]
+    parts = [
+        sp.csr_array(j @ solve(columns[:, k : min(k + step, m)].toarray()))
+        for k in range(0, m, step)
+    ]
     a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
     gap = mass - mass.T
     if gap.nnz == 0 or not np.any(gap.data):
@@ -148,7 +170,15 @@ def read(path: str | os.PathLike[str]) -> Stored:
             file = _read_file(HDF5Reader(h5py, stream))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except (
+        OSError,
+        KeyError,
+        RuntimeError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        MemoryError,
+    ) as error:
         raise InputError(
             f"{path} cannot be read as HDF5 ({error}); the file is damaged or not an HDF5 file: write it again"
         ) from None
@@ -159,24 +189,33 @@ def read(path: str | os.PathLike[str]) -> Stored:
         raise InputError(f"{path}: {error}") from None
     point = file.solution
     return Stored(
-        problem, file.group, impulse=_join_impulse(point) if "r" in point else None,
-        slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None, compare=file.compare,
-        guesses=guesses, info=file.info,
-    )  # fmt: skip
+        problem,
+        file.group,
+        impulse=_join_impulse(point) if "r" in point else None,
+        slack=np.append(point["u"], np.zeros(len(point.get("l", ())))) if "u" in point else None,
+        compare=file.compare,
+        guesses=guesses,
+        info=file.info,
+    )
 
 
 def _read_file(r: HDF5Reader) -> Contents:
     """Read an open file; check all lengths before reading numbers."""
-    present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has_path(name)]
+    present = [
+        name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has_path(name)
+    ]
     if not present:
         found = ", ".join(list(r.file)[:8]) or "nothing"
         raise InputError(
             f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}, with the suffix {ROLLING} if contacts have "
             "rolling friction"
         )
-    group, rolling = present[0], present[0].endswith(ROLLING)
+    group = present[0]
+    rolling = present[0].endswith(ROLLING)
     if present[-1].endswith(ROLLING) != rolling:
-        raise InputError(f"the file holds the groups {' and '.join(present)}; only one of the two is needed")
+        raise InputError(
+            f"the file holds the groups {' and '.join(present)}; only one of the two is needed"
+        )
     spacedim = r.read_integer(f"{group}/spacedim")
     if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
         needed = f"{ROLLING_ROWS}, as rolling friction has," if rolling else "2 or 3"
@@ -194,23 +233,41 @@ def _read_file(r: HDF5Reader) -> Contents:
     if m % spacedim:
         raise InputError(f"{group} has {m} rows; a multiple of spacedim = {spacedim} is needed")
     size = {"m": m, "n": n, "p": p, "c": m // spacedim}
-    absent = [*("" if has_equations else "VRG"), *("" if p else "sb"), *([] if rolling else ["mu_r"])]
-    parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
+    absent = [
+        *("" if has_equations else "VRG"),
+        *("" if p else "sb"),
+        *([] if rolling else ["mu_r"]),
+    ]
+    parts = {
+        name: shape
+        for name, shape in PARTS[LOCAL if local else GLOBAL].items()
+        if name not in absent
+    }
     shapes: dict[str, Any] = {name: tuple(size[x] for x in shape) for name, shape in parts.items()}
     matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
     for name in names:
         r.find_dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
     count = r.read_integer("guesses/number_of_guesses") if r.has_path("guesses") else 0
     if count < 0 or (count > 0 and count > len(r.find_node("guesses"))):
-        raise InputError(f"guesses/number_of_guesses is {count}; it has {len(r.find_node('guesses')) - 1}")
-    values: dict[str, Any] = {name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices}
+        raise InputError(
+            f"guesses/number_of_guesses is {count}; it has {len(r.find_node('guesses')) - 1}"
+        )
+    values: dict[str, Any] = {
+        name: r.read_matrix(f"{group}/{name}", shapes[name]) for name in matrices
+    }
     values |= {name: r.read_vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
-        group, spacedim, values, solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
+        group,
+        spacedim,
+        values,
+        solution=_read_point(r, "solution", n, m, p) if r.has_path("solution") else {},
         guesses=tuple(_read_point(r, f"guesses/{i + 1}", n, m, p) for i in range(count)),
-        info={name: r.read_text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
+        info={
+            name: r.read_text(f"{group}/info/{name}")
+            for name in ("title", "description", "math_info")
+        },
         compare=r.read_text("reference/compare"),
-    )  # fmt: skip
+    )
 
 
 def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
@@ -220,7 +277,9 @@ def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, 
         if size and r.has_path(f"{group}/{name}"):
             point[name] = r.read_vector(f"{group}/{name}", size)
     if p and "l" not in point:
-        raise InputError(f"{group} has no dataset l; the multipliers of the {p} equations are needed in it")
+        raise InputError(
+            f"{group} has no dataset l; the multipliers of the {p} equations are needed in it"
+        )
     return point
 
 
@@ -228,14 +287,20 @@ def _read_point(r: HDF5Reader, group: str, n: int, m: int, p: int) -> dict[str, 
 
 
 def write(
-    problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, drop: Collection[str] = ()
+    problem: Problem,
+    path: str | os.PathLike[str],
+    *,
+    impulse: Any = None,
+    drop: Collection[str] = (),
 ) -> None:
     """Save a friction contact problem in the local form, W = A and q = -b; see `lavender.io.save`."""
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
-        raise InputError(f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be")
+        raise InputError(
+            f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be"
+        )
     obstacles = _list_unsupported_data(problem, drop)
     if obstacles:
         raise CapabilityError(f"FCLIB cannot hold {'; '.join(obstacles)}. An .npz holds everything")
@@ -285,28 +350,46 @@ def _list_unsupported_data(problem: Problem, drop: Collection[str]) -> list[str]
     rows = ~c.contact_rows
     is_free = np.isneginf(c.lower) & np.isposinf(c.upper)
     kind = "free rows" if np.all(is_free[rows]) else "bounded rows"
-    tangents, rolls = c.n_tangents[c.is_contact], np.count_nonzero(c.rolling_rows >= 0)
+    tangents = c.n_tangents[c.is_contact]
+    rolls = np.count_nonzero(c.rolling_rows >= 0)
     sizes = np.unique(tangents) + 1
     has_surrogate = any("\ud800" <= letter <= "\udfff" for letter in problem.name)
     names, key, precision = (name not in drop for name in ("names", "key", "precision"))
     table: tuple[tuple[Any, str], ...] = (
         (rows.any(), f"blocks of bounded rows ({int(rows.sum())} {kind}; contacts only)"),
         (c.has_ellipse, "ellipses (give problem.disk; problem.on_disk converts impulses)"),
-        (c.has_box, "boxes (FCLIB's friction is a disk: give cones.shaped('disk'), which is another law)"),
+        (
+            c.has_box,
+            "boxes (FCLIB's friction is a disk: give cones.shaped('disk'), which is another law)",
+        ),
         (np.any(c.spin_rows >= 0) or c.has_round, "torsional friction"),
-        (0 < rolls < len(tangents),
-         f"contacts with and without rolling rows ({rolls} of {len(tangents)}; all, or none)"),
+        (
+            0 < rolls < len(tangents),
+            f"contacts with and without rolling rows ({rolls} of {len(tangents)}; all, or none)",
+        ),
         (problem.n_blocks == 0, "a problem without contacts"),
-        (len(sizes) > 1 or 1 in sizes, f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)"),
-        (problem.friction != "coulomb",
-         "the 'cone' law (FCLIB means Coulomb friction: give problem.relaxed('coulomb'))"),
+        (
+            len(sizes) > 1 or 1 in sizes,
+            f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)",
+        ),
+        (
+            problem.friction != "coulomb",
+            "the 'cone' law (FCLIB means Coulomb friction: give problem.relaxed('coulomb'))",
+        ),
         (names and problem.names is not None, "names of blocks (drop=('names',) leaves them out)"),
         (key and problem.key is not None, "keys of blocks (drop=('key',) leaves them out)"),
-        (names and general is not None and general.names is not None,
-         "names of velocities (drop=('names',) leaves them out)"),
-        (precision and problem.precision != "float64",
-         f"the precision {problem.precision!r} (drop=('precision',) leaves it out)"),
+        (
+            names and general is not None and general.names is not None,
+            "names of velocities (drop=('names',) leaves them out)",
+        ),
+        (
+            precision and problem.precision != "float64",
+            f"the precision {problem.precision!r} (drop=('precision',) leaves it out)",
+        ),
         (has_surrogate, "half a surrogate pair in its name (give another name)"),
-        ("\0" in problem.name, "a NUL character in its name, which ends texts in FCLIB (give another name)"),
-    )  # fmt: skip
+        (
+            "\0" in problem.name,
+            "a NUL character in its name, which ends texts in FCLIB (give another name)",
+        ),
+    )
     return [text for is_present, text in table if is_present]

@@ -29,7 +29,9 @@ from lavender.io.engine_step import Claims, EngineStep
 
 LIMIT, PYRAMIDAL = 3, 6  # Values of mjtConstraint: a joint limit, an edge of a pyramid.
 ROWS_OF_NORMAL_AND_TANGENTS = 3
-DEFAULT_FRICTION = 1.0  # [-] Coefficient of a geom with a material that has none, such as `morphs.Plane()`.
+DEFAULT_FRICTION = (
+    1.0  # [-] Coefficient of a geom with a material that has none, such as `morphs.Plane()`.
+)
 GENESIS_ADVICE = "genesis-world 1.4 is known"
 
 
@@ -68,14 +70,17 @@ def from_genesis(scene: Any) -> EngineStep:
     try:
         step = _convert_solver_arrays(scene, solver)
         # Coefficients of materials, and whether a plane has none and therefore the default one.
-        coefficients, has_default_plane = [DEFAULT_FRICTION], False
+        coefficients = [DEFAULT_FRICTION]
+        has_default_plane = False
         for entity in getattr(scene, "entities", ()):
             coefficient = getattr(entity.material, "friction", None)
             if coefficient is not None:
                 coefficients.append(float(coefficient))
             has_default_plane |= coefficient is None and type(entity.morph).__name__ == "Plane"
     except AttributeError as error:
-        raise CapabilityError(f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}") from None
+        raise CapabilityError(
+            f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}"
+        ) from None
     if has_default_plane and min(coefficients) < DEFAULT_FRICTION:
         warnings.warn(
             f"a body has friction {min(coefficients):g}, and a plane the default of {DEFAULT_FRICTION:g}. Genesis "
@@ -87,23 +92,29 @@ def from_genesis(scene: Any) -> EngineStep:
 
 def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     """Read the engine's arrays and build the batch."""
-    config, constraints = solver.rigid_config, solver.constraint_solver.constraint_state
+    config = solver.rigid_config
+    constraints = solver.constraint_solver.constraint_state
     _check_configuration(scene, solver)
     rows = _copy_to_host(constraints.n_constraints).astype(np.int32)
     equalities, losses, contact_rows = (
         _copy_to_host(getattr(constraints, f"n_constraints_{kind}")).astype(np.int64)
         for kind in ("equality", "frictionloss", "cone")
     )
-    n, m = len(rows), int(rows.max(initial=0))
+    n = len(rows)
+    m = int(rows.max(initial=0))
     size = int(config.rows_per_contact)
     is_elliptic = bool(config.enable_elliptic_friction)
     if not is_elliptic:
-        contact_rows = size * _copy_to_host(solver.collider.collider_state.n_contacts).astype(np.int64)
+        contact_rows = size * _copy_to_host(solver.collider.collider_state.n_contacts).astype(
+            np.int64
+        )
     index = np.arange(m)
     ends = np.cumsum([equalities, losses, contact_rows], axis=0)[:, :, None]  # Shape (3, n, 1).
     contact_type = ELLIPTIC if is_elliptic else PYRAMIDAL
     row_type = np.select(
-        [index < ends[0], index < ends[1], index < ends[2]], [EQUALITY, FRICTION[0], contact_type], LIMIT
+        [index < ends[0], index < ends[1], index < ends[2]],
+        [EQUALITY, FRICTION[0], contact_type],
+        LIMIT,
     )
     loss = _copy_to_host(constraints.efc_frictionloss, m).T
     contacts = None
@@ -118,7 +129,8 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         for j in range(ROWS_OF_NORMAL_AND_TANGENTS, size):
             friction[:, j - 1] = loss[world, address + j]
         contacts = world, address, np.full(len(world), size), friction
-    dofs, dt = solver.dyn_state.dofs, float(solver.substep_dt)
+    dofs = solver.dyn_state.dofs
+    dt = float(solver.substep_dt)
     jac = np.ascontiguousarray(np.moveaxis(_copy_to_host(constraints.jac, m), 2, 0))
     velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(dofs.acc).T
     moved_by = "acceleration"
@@ -126,20 +138,32 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         from genesis import integrator
 
         moved_by = "forces" if config.integrator == integrator.implicitfast else moved_by
-        if config.integrator == integrator.Euler and _copy_to_host(solver.dyn_info.dofs.damping).any():
+        if (
+            config.integrator == integrator.Euler
+            and _copy_to_host(solver.dyn_info.dofs.damping).any()
+        ):
             raise CapabilityError(
                 "enable_mujoco_compatibility with Euler moves trees with damping by forces and others by "
                 "accelerations, which is not supported: change one of both"
             )
     result = from_efc(
-        efc_J=jac, efc_D=_copy_to_host(constraints.efc_D, m).T, efc_aref=_copy_to_host(constraints.aref, m).T,
-        efc_type=row_type, M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
-        qvel=velocity.astype(jac.dtype), qacc_smooth=_copy_to_host(dofs.acc_smooth).T, timestep=dt,
-        efc_frictionloss=np.abs(loss), nefc=rows, contacts=contacts,
-        efc_force=_copy_to_host(constraints.efc_force, m).T, qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
-        qacc=_copy_to_host(constraints.qacc).T, moved_by=moved_by,
+        efc_J=jac,
+        efc_D=_copy_to_host(constraints.efc_D, m).T,
+        efc_aref=_copy_to_host(constraints.aref, m).T,
+        efc_type=row_type,
+        M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
+        qvel=velocity.astype(jac.dtype),
+        qacc_smooth=_copy_to_host(dofs.acc_smooth).T,
+        timestep=dt,
+        efc_frictionloss=np.abs(loss),
+        nefc=rows,
+        contacts=contacts,
+        efc_force=_copy_to_host(constraints.efc_force, m).T,
+        qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
+        qacc=_copy_to_host(constraints.qacc).T,
+        moved_by=moved_by,
         friction="coulomb" if config.enable_signorini_contact else "cone",
-    )  # fmt: skip
+    )
     converged = ~_copy_to_host(constraints.improved).astype(bool)
     assert result.impulse is not None
     return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
@@ -151,14 +175,24 @@ def _check_configuration(scene: Any, solver: Any) -> None:
     coupler = type(scene.sim.coupler).__name__
     has_more_friction = config.enable_torsional_friction or config.enable_rolling_friction
     for is_used, name in (
-        (solver._options.noslip_iterations > 0, "noslip_iterations changes impulses after the solve"),
+        (
+            solver._options.noslip_iterations > 0,
+            "noslip_iterations changes impulses after the solve",
+        ),
         (config.use_hibernation, "use_hibernation leaves bodies out of the problem"),
-        (coupler != "LegacyCoupler" and coupler != "NoneType", f"the {coupler} solves additional contacts"),
-        (config.enable_signorini_contact and has_more_friction,
-         "contact_resolution=signorini with torsional or rolling friction is another friction law"),
-    ):  # fmt: skip
+        (
+            coupler != "LegacyCoupler" and coupler != "NoneType",
+            f"the {coupler} solves additional contacts",
+        ),
+        (
+            config.enable_signorini_contact and has_more_friction,
+            "contact_resolution=signorini with torsional or rolling friction is another friction law",
+        ),
+    ):
         if is_used:
-            raise CapabilityError(f"{name}, which is not supported: change this setting of the scene")
+            raise CapabilityError(
+                f"{name}, which is not supported: change this setting of the scene"
+            )
 
 
 def _copy_to_host(array: Any, rows: int | None = None) -> Any:

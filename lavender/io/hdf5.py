@@ -24,7 +24,9 @@ class HDF5Reader:
         # HDF5 would read beyond the end of a chunk that is shorter than its checksum of 4 bytes.
         has_checksum = isinstance(node, self.h5py.Dataset) and node.fletcher32
         if has_checksum and node.id.chunk_iter(lambda chunk: True if chunk.size < 4 else None):
-            raise InputError(f"{path} has an incomplete chunk; the file is damaged: write or copy it again")
+            raise InputError(
+                f"{path} has an incomplete chunk; the file is damaged: write or copy it again"
+            )
         return node
 
     def has_path(self, path: str) -> bool:
@@ -66,7 +68,11 @@ class HDF5Reader:
             return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
-        return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
+        return (
+            value.decode("utf-8", "replace").rstrip("\0")
+            if isinstance(value, bytes)
+            else str(value)
+        )
 
     def read_matrix_shape(self, path: str) -> tuple[int, int]:
         """Return the numbers of rows and columns that a matrix declares."""
@@ -103,7 +109,9 @@ class HDF5Reader:
                 if min(len(p), len(i), len(x)) < nz:
                     sizes = f"{len(p)}, {len(i)} and {len(x)}"
                     raise InputError(f"nz announces {nz} triplets; p, i and x have {sizes}")
-                p, i, x = p[:nz].astype(np.int64), i[:nz].astype(np.int64), x[:nz]
+                p = p[:nz].astype(np.int64)
+                i = i[:nz].astype(np.int64)
+                x = x[:nz]
                 if nz and (p.min() < 0 or i.min() < 0 or p.max() >= n or i.max() >= m):
                     raise InputError(
                         f"row indices i or column indices p are outside of the matrix ({m}, {n})"
@@ -119,7 +127,11 @@ def write_matrix(group: Any, a: sp.csr_array) -> None:
     """Write a matrix in compressed rows, as a group with FCLIB's names of the arrays."""
     for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
         write_array(group, name, np.array([value], np.int32))
-    for name, array in (("p", a.indptr.astype(np.int32)), ("i", a.indices.astype(np.int32)), ("x", a.data)):
+    for name, array in (
+        ("p", a.indptr.astype(np.int32)),
+        ("i", a.indices.astype(np.int32)),
+        ("x", a.data),
+    ):
         write_array(group, name, array)
 
 

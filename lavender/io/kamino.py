@@ -68,7 +68,9 @@ _LAYOUTS: WeakKeyDictionary[Any, _Layout] = WeakKeyDictionary()  # The layout of
 _VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # A diverged world has NaN or huge numbers.
+@np.errstate(
+    over="ignore", invalid="ignore", divide="ignore"
+)  # A diverged world has NaN or huge numbers.
 def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     """Return the problems that a `SolverKamino` solved in its last step, its impulses and its claims.
 
@@ -98,7 +100,9 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
     verify = check_bool("verify", verify)
     engine = getattr(solver, "_solver_kamino", None)
     if engine is None:
-        raise InputError(f"solver is a {type(solver).__name__}; a newton.solvers.SolverKamino is needed")
+        raise InputError(
+            f"solver is a {type(solver).__name__}; a newton.solvers.SolverKamino is needed"
+        )
     try:
         _check_configuration(engine)
         layout = _LAYOUTS.get(solver)
@@ -108,12 +112,16 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
         step = worlds.convert()
         status = solver.status.numpy()
         residuals = {
-            name: status[name].astype(float) for name in status.dtype.names if name in RESIDUAL_NAMES
+            name: status[name].astype(float)
+            for name in status.dtype.names
+            if name in RESIDUAL_NAMES
         }
         claims = Claims(status["converged"] != 0, status["iterations"].astype(np.int64), residuals)
         _verify_delassus_matrix(solver, engine, worlds, verify)
     except AttributeError as error:
-        raise CapabilityError(f"this SolverKamino lacks an attribute: {error}. {KAMINO_ADVICE}") from None
+        raise CapabilityError(
+            f"this SolverKamino lacks an attribute: {error}. {KAMINO_ADVICE}"
+        ) from None
     return EngineStep(*step, claims)
 
 
@@ -130,7 +138,9 @@ def _check_configuration(engine: Any) -> None:
     if engine.problem_fd is None or (
         not config.sparse_jacobian and engine._jacobians.data.J_cts_data is None
     ):
-        raise InputError("this model has no joints, limits or contacts, so it has no constraint problem")
+        raise InputError(
+            "this model has no joints, limits or contacts, so it has no constraint problem"
+        )
 
 
 class _Layout:
@@ -158,7 +168,11 @@ class _Layout:
         # arrays.
         self.soft_rows = {}
         for kind in ("dynamic", "effort"):
-            names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
+            names = (
+                f"num_joint_{kind}_cts",
+                f"joint_{kind}_cts_offset",
+                f"joint_{kind}_cts_group_offset",
+            )
             count, offset, group = (_as_int(getattr(info, name))[:n] for name in names)
             world = np.repeat(np.arange(n), count)
             k = np.arange(len(world)) - _cumulate_counts(count)[world]
@@ -170,7 +184,9 @@ class _Layout:
         before = _cumulate_counts(count)
         self.joint_rows = group + per_world
         self.joint_world, self.joint_size = world[count > 0], count[count > 0]
-        self.joint_begin = (group[world] + before[:-1] - _cumulate_counts(per_world)[world])[count > 0]
+        self.joint_begin = (group[world] + before[:-1] - _cumulate_counts(per_world)[world])[
+            count > 0
+        ]
 
 
 class _Worlds:
@@ -178,7 +194,9 @@ class _Worlds:
 
     def __init__(self, engine: Any, layout: _Layout, stored_contacts: Any) -> None:
         self.stored_contacts = stored_contacts
-        self.engine, self.problem, self.layout = engine, engine.problem_fd.data, layout
+        self.engine = engine
+        self.problem = engine.problem_fd.data
+        self.layout = layout
         self.bodies, self.columns, self.n = layout.bodies, layout.columns, layout.n
         problem, n = self.problem, layout.n
         self.joints, self.bounded, self.limits, self.contacts = (
@@ -193,14 +211,17 @@ class _Worlds:
                 f"world {world} has {stored[world]} rows; its joints, bounded rows, limits and contacts have "
                 f"{self.rows[world]}. {KAMINO_ADVICE}"
             )
-        self.row_ptr, self.velocity_ptr = _cumulate_counts(self.rows), layout.velocity_ptr
+        self.row_ptr = _cumulate_counts(self.rows)
+        self.velocity_ptr = layout.velocity_ptr
         self.world = np.repeat(np.arange(n), self.rows)  # World of each row.
         # Index of each row within its world.
         self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]
         # Index of the same row in the engine's order: both tangents of a contact, then its normal.
         self.source = self.index.copy()
         self.is_contact_row = self.index >= self.before_contacts[self.world]
-        rank = (self.index - self.before_contacts[self.world])[self.is_contact_row] % ROWS_PER_CONTACT
+        rank = (self.index - self.before_contacts[self.world])[
+            self.is_contact_row
+        ] % ROWS_PER_CONTACT
         self.source[self.is_contact_row] += NORMAL_FIRST[rank] - rank
         self.begins_contact = np.zeros(len(self.index), bool)
         self.begins_contact[self.is_contact_row] = rank == 0
@@ -213,10 +234,17 @@ class _Worlds:
         if not self.engine._config.sparse_jacobian:
             data = self.engine._jacobians.data
             return data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
-        blocks = self.engine._jacobians._J_cts.bsm  # Each block has one row and the six columns of a body.
-        count, start = _as_int(blocks.num_nzb), _cumulate_counts(self.rows * self.columns)
+        blocks = (
+            self.engine._jacobians._J_cts.bsm
+        )  # Each block has one row and the six columns of a body.
+        count = _as_int(blocks.num_nzb)
+        start = _cumulate_counts(self.rows * self.columns)
         world = np.repeat(np.arange(self.n), count)
-        block = _as_int(blocks.nzb_start)[world] + np.arange(len(world)) - _cumulate_counts(count)[world]
+        block = (
+            _as_int(blocks.nzb_start)[world]
+            + np.arange(len(world))
+            - _cumulate_counts(count)[world]
+        )
         row, column = _as_int(blocks.nzb_coords)[block].T
         first = start[world] + row * self.columns[world] + column
         values = np.zeros(start[-1], np.float32)
@@ -232,8 +260,11 @@ class _Worlds:
         moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[velocity_position]
         jac, products = self._form_jacobian(free, moves)
         target = products - _copy_as_float64(self.problem.v_f)[self.position] / scale
-        stored, joints = self.problem.compliance, self.engine.data.joints
-        soft = np.zeros(len(self.index)) if stored is None else _copy_as_float64(stored)[self.position]
+        stored = self.problem.compliance
+        joints = self.engine.data.joints
+        soft = (
+            np.zeros(len(self.index)) if stored is None else _copy_as_float64(stored)[self.position]
+        )
         for kind, values in (("dynamic", joints.inv_m_j), ("effort", joints.inv_m_a)):
             world, row, position = self.layout.soft_rows[kind]
             if len(world):
@@ -243,9 +274,13 @@ class _Worlds:
         wrong = self._find_worlds_of_rows(
             ~np.isfinite(target) | ~np.isfinite(self.compliance) | ~(scale > 0.0)
         )
-        wrong |= self._find_worlds_of_rows(np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0))
+        wrong |= self._find_worlds_of_rows(
+            np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0)
+        )
         is_wrong_row = wrong[self.world]
-        lower[is_wrong_row], upper[is_wrong_row], mu[is_wrong_row] = -np.inf, np.inf, 0.0
+        lower[is_wrong_row] = -np.inf
+        upper[is_wrong_row] = np.inf
+        mu[is_wrong_row] = 0.0
         free[wrong[self.layout.velocity_world]] = np.nan
         begins = ~self.is_contact_row | self.begins_contact
         layout = self.layout
@@ -255,26 +290,38 @@ class _Worlds:
                 f"which this importer needs. {KAMINO_ADVICE}"
             )
         # All kinematic rows of a joint form one block.
-        start, size = self.row_ptr[layout.joint_world] + layout.joint_begin, layout.joint_size
+        start = self.row_ptr[layout.joint_world] + layout.joint_begin
+        size = layout.joint_size
         begins[np.repeat(start - _cumulate_counts(size)[:-1], size) + np.arange(size.sum())] = False
         begins[start] = True
         first = np.flatnonzero(begins)
         cones = Cones(
             ptr=np.append(first, len(begins)).astype(np.int32),
-            kind=np.where(self.begins_contact[first], CONTACT, ROW).astype(np.int32), lower=lower, upper=upper,
-            mu=mu[first], patch_radius=np.zeros(len(first)),
-        )  # fmt: skip
+            kind=np.where(self.begins_contact[first], CONTACT, ROW).astype(np.int32),
+            lower=lower,
+            upper=upper,
+            mu=mu[first],
+            patch_radius=np.zeros(len(first)),
+        )
         ragged = {"velocity_ptr": self.velocity_ptr} if jac.ndim == 1 else {}
         batch = Batch(
-            jac, mass, free if jac.ndim == 1 else free.reshape(self.n, -1), target=target, cones=cones,
-            compliance=self.compliance, friction="coulomb", row_ptr=self.row_ptr, **ragged,
-        )  # fmt: skip
+            jac,
+            mass,
+            free if jac.ndim == 1 else free.reshape(self.n, -1),
+            target=target,
+            cones=cones,
+            compliance=self.compliance,
+            friction="coulomb",
+            row_ptr=self.row_ptr,
+            **ragged,
+        )
         batch.precision = "float32"
         batch.names_of = self._make_block_namer(first)
         ends = np.cumsum(np.append(0, self.columns[self.world]))
 
         def find_angular_rows_of_world(i: int) -> Any:
-            begin, end = self.row_ptr[i], self.row_ptr[i + 1]
+            begin = self.row_ptr[i]
+            end = self.row_ptr[i + 1]
             own = jac[begin:end] if jac.ndim == 2 else jac[ends[begin] : ends[end]]
             linear, angular = np.abs(own).reshape(end - begin, -1, 2, 3).sum(axis=(1, 3)).T
             return (linear == 0.0) & (angular > 0.0)
@@ -293,7 +340,9 @@ class _Worlds:
         J is (rows, nv) if all worlds have equal numbers of bodies, else a flat array of all entries.
         """
         values, start = self.jacobian_values, self.jacobian_start
-        first = start[self.world] + self.source * self.columns[self.world]  # First entry of each row.
+        first = (
+            start[self.world] + self.source * self.columns[self.world]
+        )  # First entry of each row.
         if self.layout.has_equal_bodies:
             nv = int(self.columns[0])
             jac = values[first[:, None] + np.arange(nv)].astype(float)
@@ -331,7 +380,11 @@ class _Worlds:
             )
         inertia = np.linalg.inv(inv_inertia)
         values = np.concatenate(
-            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *INERTIA_ENTRIES)]], axis=1
+            [
+                np.repeat(1.0 / inv_mass[:, None], 3, axis=1),
+                inertia[(slice(None), *INERTIA_ENTRIES)],
+            ],
+            axis=1,
         )
         if self.layout.has_equal_bodies:
             return (values.reshape(self.n, -1), *self.layout.mass_pattern), is_fixed
@@ -348,7 +401,9 @@ class _Worlds:
     def _compute_row_bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return lower bounds, upper bounds [N s] and friction coefficients of all rows; 0 on rows of joints."""
         problem, world, index = self.problem, self.world, self.index
-        lower, upper, mu = np.full(len(index), -np.inf), np.full(len(index), np.inf), np.zeros(len(index))
+        lower = np.full(len(index), -np.inf)
+        upper = np.full(len(index), np.inf)
+        mu = np.zeros(len(index))
         is_bounded = (index >= self.joints[world]) & (index < (self.joints + self.bounded)[world])
         if is_bounded.any():
             k = (_as_int(problem.bcio)[world] + index - self.joints[world])[is_bounded]
@@ -357,7 +412,9 @@ class _Worlds:
         is_limit = (index >= (self.joints + self.bounded)[world]) & ~self.is_contact_row
         lower[is_limit] = 0.0
         at = self.begins_contact
-        k = (_as_int(problem.cio)[world] + (index - self.before_contacts[world]) // ROWS_PER_CONTACT)[at]
+        k = (
+            _as_int(problem.cio)[world] + (index - self.before_contacts[world]) // ROWS_PER_CONTACT
+        )[at]
         mu[at] = _copy_as_float64(problem.mu)[k]
         return lower, upper, mu
 
@@ -398,7 +455,8 @@ class _Worlds:
 
     def compare_delassus_matrix(self, i: int) -> float:
         """Return the largest difference of the engine's D from J M^-1 J^T in world i, relative to D's largest entry."""
-        size, first_body = int(self.rows[i]), int(self.layout.first_body[i])
+        size = int(self.rows[i])
+        first_body = int(self.layout.first_body[i])
         bodies = slice(first_body, first_body + int(self.bodies[i]))
         if size == 0:
             return 0.0

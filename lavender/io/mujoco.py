@@ -63,7 +63,9 @@ DIVERGED_TEXT = (
     "qacc holds numbers that are not finite: the simulation has diverged, or the data was changed. Use data of an "
     "earlier step"
 )
-FLOAT32_GAP = 1e-5  # [-] Largest relative difference of M qacc_smooth and qfrc_smooth of data in float32.
+FLOAT32_GAP = (
+    1e-5  # [-] Largest relative difference of M qacc_smooth and qfrc_smooth of data in float32.
+)
 FLOAT32_ADVICE = (
     "as in float32: mjx.get_data and mujoco_warp.get_data_into copy results of an engine in float32. Pass the arrays "
     "of that engine (efc_J, efc_D, efc_aref, ...) to lavender.io.from_efc"
@@ -102,7 +104,8 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         convergence: the problem does not depend on the answer.
     """
     step = read_step(model, data)
-    kept, dt = step.cache, _get_timestep(step)
+    kept = step.cache
+    dt = _get_timestep(step)
     if step.has_noslip:
         name += " (noslip)"
     mass, change = _read_mass(step, data)
@@ -120,7 +123,12 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     operator = kept.operator = general.operator
     rest = kept.mj, model, blocks, b, compliance, general
     is_stiff = step.m > 0 and compliance.min() < MAX_EXAMINED_COMPLIANCE
-    if is_regular and change is None and not is_stiff and not operator.has_entry_above(MAX_SAFE_ENTRY):
+    if (
+        is_regular
+        and change is None
+        and not is_stiff
+        and not operator.has_entry_above(MAX_SAFE_ENTRY)
+    ):
         view = make_generalized_data(blocks, b, operator, compliance, LAWS["cone"])
         problem: Problem = Problem._from_checked_data(view, "cone", name, (_make_fields, rest))
     else:
@@ -177,7 +185,8 @@ def engine_answer(model: Any, data: Any) -> EngineAnswer:
         After `mj_forward` or `mj_step`. It is not changed.
     """
     step = read_step(model, data)
-    dt, mj = _get_timestep(step), step.cache.mj
+    dt = _get_timestep(step)
+    mj = step.cache.mj
     scale = get_row_scales(make_blocks(step, data))
     impulse = _scale_force(step, data, scale)
     before = _get_velocity_before(step)
@@ -206,7 +215,11 @@ def compute_prediction_gap(problem: Problem) -> float:
     if data is None or not np.array_equal(data.qvel, after):
         return float("nan")
     gap = float(np.abs(engine_answer(model, data).velocity - after).max(initial=0.0))
-    return gap if not gap <= PREDICTION_TOLERANCE * max(1.0, float(np.abs(after).max(initial=0.0))) else 0.0
+    return (
+        gap
+        if not gap <= PREDICTION_TOLERANCE * max(1.0, float(np.abs(after).max(initial=0.0)))
+        else 0.0
+    )
 
 
 def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray) -> FloatArray:
@@ -215,7 +228,8 @@ def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray
     MuJoCo's own integrator runs with J^T f, and without an acceleration. Where MuJoCo's sum J^T f differs by rounding
     only, it is used: large forces may cancel.
     """
-    total, terms = jac.T @ force, abs(jac).T @ np.abs(force)
+    total = jac.T @ force
+    terms = abs(jac).T @ np.abs(force)
     is_rounding = np.abs(total - data.qfrc_constraint) <= SUM_TOLERANCE * terms
     data.qfrc_constraint[:] = np.where(is_rounding, data.qfrc_constraint, total)
     data.qacc[:] = np.nan
@@ -231,7 +245,8 @@ def find_mover(step: Step, is_stepped: bool) -> str:
     `implicitfast` solve (M - h dF/dv) a = qfrc_smooth + qfrc_constraint; all other methods use qacc. RK4 uses the qacc
     of each of its four passes: after a step, the rows belong to the last pass, and qacc is the mean of all.
     """
-    model, mj = step.model, step.cache.mj
+    model = step.model
+    mj = step.cache.mj
     option, kinds = model.opt, mj.mjtIntegrator
     if step.is_discrete:
         return "acceleration"
@@ -243,13 +258,16 @@ def find_mover(step: Step, is_stepped: bool) -> str:
         return "forces" if is_implicit else "acceleration"
     # Euler's method uses forces if it is implicit in the dampings of joints.
     bits = mj.mjtDisableBit
-    off = int(bits.mjDSBL_EULERDAMP) | int(getattr(bits, "mjDSBL_DAMPER", getattr(bits, "mjDSBL_PASSIVE", 0)))
+    off = int(bits.mjDSBL_EULERDAMP) | int(
+        getattr(bits, "mjDSBL_DAMPER", getattr(bits, "mjDSBL_PASSIVE", 0))
+    )
     if int(option.disableflags) & off:
         return "acceleration"
     if np.count_nonzero(model.dof_damping):  # In a tenth of the time of `any`.
         return "forces"
     # MuJoCo 4 has polynomial dampings, and dampings of actuators that act on the velocities of joints.
-    poly, actuators = getattr(model, "dof_dampingpoly", ()), getattr(model, "jnt_actuatorid", -1)
+    poly = getattr(model, "dof_dampingpoly", ())
+    actuators = getattr(model, "jnt_actuatorid", -1)
     is_damped = np.count_nonzero(poly) or np.count_nonzero(actuators != -1)
     return "forces" if is_damped else "acceleration"
 
@@ -259,13 +277,17 @@ def _make_fields(
 ) -> dict[str, Any]:
     """Return the fields of a problem; `blocks` is the result of `mujoco_rows.make_blocks`."""
     m, numbers = blocks.n_rows, blocks.numbers
-    first, count = len(numbers) - m, blocks.n_blocks
+    first = len(numbers) - m
+    count = blocks.n_blocks
     return {
-        "b": b, "generalized": general, "compliance": compliance, "cones": Cones._from_blocks(blocks),
+        "b": b,
+        "generalized": general,
+        "compliance": compliance,
+        "cones": Cones._from_blocks(blocks),
         "key": numbers[first : first + count].view(np.uint64),
         "names": Names(count, lambda: make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
         "angular": find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m),
-    }  # fmt: skip
+    }
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -298,7 +320,8 @@ def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     step = read_step(model, data)
     lam = as_array("impulse", impulse, (step.m,), unit="N s")
     force = jacobian(model, data).T @ (scaling(model, data) * lam) / step.dt
-    smooth, mj = data.qacc_smooth, step.cache.mj
+    smooth = data.qacc_smooth
+    mj = step.cache.mj
     if step.is_discrete:
         matrix = compute_discrete_matrix(mj, model, data, CHANGED_ADVICE)
         return smooth + matrix.solve(force) + (0.0 if matrix.change is None else matrix.change)
@@ -349,7 +372,9 @@ def _read_mass(step: Step, data: Any) -> tuple[Any, Any]:
         difference = f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size"
         if gap <= FLOAT32_GAP:
             raise CapabilityError(f"{difference}, {FLOAT32_ADVICE}")
-        raise CapabilityError(f"{difference}: the problem was built with another M. {CHANGED_ADVICE}")
+        raise CapabilityError(
+            f"{difference}: the problem was built with another M. {CHANGED_ADVICE}"
+        )
     return mass, None
 
 
@@ -364,9 +389,12 @@ def find_mass_pattern(step: Step) -> tuple[IntArray, IntArray]:
     kept, model = step.cache, step.model
     if mujoco_rows.has_mass_pattern(step, kept.pattern):
         return kept.pattern
-    count, columns = model.M_rownnz, mark_read_only(model.M_colind.copy())
+    count = model.M_rownnz
+    columns = mark_read_only(model.M_colind.copy())
     indptr = np.append(0, np.cumsum(count)).astype(np.int32)
-    is_consecutive = np.all(count > 0) and np.array_equal(indptr, np.append(model.M_rowadr, len(columns)))
+    is_consecutive = np.all(count > 0) and np.array_equal(
+        indptr, np.append(model.M_rowadr, len(columns))
+    )
     if (
         not is_consecutive
         or np.any(columns < 0)
@@ -391,12 +419,16 @@ def _read_jacobian(step: Step, data: Any, blocks: Any) -> Any:
     result = mujoco_rows.read_jacobian(step, blocks)
     if isinstance(result, tuple):
         return result
-    m, n, values = step.m, step.n, np.ravel(data.efc_J)
+    m = step.m
+    n = step.n
+    values = np.ravel(data.efc_J)
     if result == -1:
         raise InputError(
             f"efc_J holds {len(values)} numbers; {m} x {n} are needed if opt.jacobian is dense. {CHANGED_ADVICE}"
         )
-    count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, np.ravel(data.efc_J_colind)
+    count = data.efc_J_rownnz
+    first = data.efc_J_rowadr
+    columns = np.ravel(data.efc_J_colind)
     if not len(count) == len(first) == m:
         raise InputError(
             f"efc_J_rownnz has {len(count)} entries and efc_J_rowadr {len(first)}; {m} are needed, one for "
@@ -411,7 +443,9 @@ def _read_jacobian(step: Step, data: Any, blocks: Any) -> Any:
     indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
     source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
     scale = np.ones(m) if blocks is None else get_row_scales(blocks)
-    jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
+    jac = sp.csr_array(
+        (values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n)
+    )
     jac.sum_duplicates()
     return jac.indptr.astype(np.int32), jac.indices.astype(np.int32), mark_read_only(jac.data)
 
@@ -513,7 +547,9 @@ def make_blocks(step: Step, data: Any, max_equality_rows: int = mujoco_rows.MAX_
             f"{counts[kind]}{dim}, which does not exist or has fewer rows. {CHANGED_ADVICE}"
         )
     if result.fault:
-        raise InputError(f"efc_frictionloss or contact friction is negative or not finite. {CHANGED_ADVICE}")
+        raise InputError(
+            f"efc_frictionloss or contact friction is negative or not finite. {CHANGED_ADVICE}"
+        )
     return result
 
 
@@ -529,20 +565,31 @@ def find_angular_rows(mj: Any, model: Any, ints: IntArray, m: int) -> npt.NDArra
     These are limits and friction of rotating joints, equalities of hinges, and the last three rows of a weld.
     """
     kinds, joints = mj.mjtConstraint, mj.mjtJoint
-    types, ids = ints[:m], ints[m : 2 * m]
+    types = ints[:m]
+    ids = ints[m : 2 * m]
     rows = np.flatnonzero(types <= int(kinds.mjCNSTR_LIMIT_JOINT))
     if not len(rows):
         return None
-    types, ids, index = types[rows], ids[rows], np.arange(len(rows))
+    types = types[rows]
+    ids = ids[rows]
+    index = np.arange(len(rows))
     begins = np.append(True, (types[1:] != types[:-1]) | (ids[1:] != ids[:-1]))
-    place = index - np.maximum.accumulate(np.where(begins, index, 0))  # Number of a row in its equality.
-    joint, axis = np.full(len(rows), -1), np.zeros(len(rows), int)
-    is_limit, is_friction = types == int(kinds.mjCNSTR_LIMIT_JOINT), types == int(kinds.mjCNSTR_FRICTION_DOF)
+    place = index - np.maximum.accumulate(
+        np.where(begins, index, 0)
+    )  # Number of a row in its equality.
+    joint = np.full(len(rows), -1)
+    axis = np.zeros(len(rows), int)
+    is_limit, is_friction = (
+        types == int(kinds.mjCNSTR_LIMIT_JOINT),
+        types == int(kinds.mjCNSTR_FRICTION_DOF),
+    )
     is_equality = types == int(kinds.mjCNSTR_EQUALITY)
     joint[is_limit] = ids[is_limit]
     joint[is_friction] = model.dof_jntid[ids[is_friction]]
     axis[is_friction] = ids[is_friction] - model.jnt_dofadr[joint[is_friction]]
-    equality = np.where(is_equality, model.eq_type[np.where(is_equality, ids, 0)] if model.neq else -1, -1)
+    equality = np.where(
+        is_equality, model.eq_type[np.where(is_equality, ids, 0)] if model.neq else -1, -1
+    )
     of_joints = equality == int(mj.mjtEq.mjEQ_JOINT)
     joint[of_joints] = model.eq_obj1id[ids[of_joints]]
     kind = np.where(joint >= 0, model.jnt_type[joint], int(joints.mjJNT_SLIDE))
@@ -561,8 +608,11 @@ def make_block_names(
     `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An equality of more than
     `joined` rows has a block for each row.
     """
-    types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
-    dim, geom = ints[2 * m : 2 * m + contacts], ints[2 * m + contacts :].reshape(-1, 2)
+    types = ints[:m].tolist()
+    ids = ints[m : 2 * m].tolist()
+    contacts = (len(ints) - 2 * m) // 3
+    dim = ints[2 * m : 2 * m + contacts]
+    geom = ints[2 * m + contacts :].reshape(-1, 2)
     words = {
         1: ("friction", "joint"),
         2: ("friction", "tendon"),
@@ -578,12 +628,15 @@ def make_block_names(
     i = 0
     while i < m:
         row_type, which = types[i], ids[i]  # row_type is a value of mjtConstraint.
-        size, part = 1, ""  # A constraint has a block for each row if its part has a name.
+        size = 1  # A constraint has a block for each row if its part has a name.
+        part = ""
         if row_type == 0:
             while i + size < m and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
             name = get_name("equality", which)
-            if size > joined:  # The rows of a flex belong to edges of its mesh, the rows of a weld to axes.
+            if (
+                size > joined
+            ):  # The rows of a flex belong to edges of its mesh, the rows of a weld to axes.
                 part = "edge" if size > mujoco_rows.MAX_BLOCK_ROWS else "axis"
         elif row_type in words:
             word, kind = words[row_type]
@@ -593,7 +646,8 @@ def make_block_names(
                 name += f", axis {ids[i] - int(model.jnt_dofadr[joint])}"
         else:
             sides = [get_name("geom", g)[5:] if g >= 0 else "flex" for g in geom[which].tolist()]
-            name, part = f"contact {which} ({', '.join(sides)})", "edge" if row_type == 6 else ""
+            name = f"contact {which} ({', '.join(sides)})"
+            part = "edge" if row_type == 6 else ""
             size = 1 if row_type == 5 else 2 * (int(dim[which]) - 1) if part else int(dim[which])
         names += [f"{name}, {part} {k}" for k in range(size)] if part else [name]
         i += size

@@ -75,7 +75,9 @@ def compute_discrete_matrix(mj: Any, model: Any, data: Any, advice: str) -> Disc
     gap, size = np.linalg.norm(residual), np.linalg.norm(force)
     # Couplings of tendons, actuators and flexes leave MuJoCo's sparsity of M: it then finds a0 by an iteration.
     is_iterative = bool(data.nefmT or data.nefmA or model.nflex)
-    is_warned = bool(data.warning[int(mj.mjtWarning.mjWARN_INERTIA)].number)  # It used up its iterations.
+    is_warned = bool(
+        data.warning[int(mj.mjtWarning.mjWARN_INERTIA)].number
+    )  # It used up its iterations.
     limit = TOLERANCE_RATIO * model.opt.tolerance if is_iterative else 0.0
     rounding = MASS_TOLERANCE * np.linalg.norm(abs(whole) @ abs(data.qacc_smooth))
     if not (gap <= limit * size + rounding or (is_iterative and is_warned and gap < np.inf)):
@@ -106,7 +108,11 @@ def _iterate_terms(model: Any, data: Any) -> Iterator[tuple[Any, Any, Any]]:
         source = np.arange(count.sum()) + np.repeat(first - (np.cumsum(count) - count), count)
         yield np.repeat(every, count), data.efm_K_colind[source], data.efm_K_val[source]
     for scale, columns, row in _iterate_rank_one_terms(model, data):
-        yield np.repeat(columns, len(row)), np.tile(columns, len(row)), (scale * np.outer(row, row)).ravel()
+        yield (
+            np.repeat(columns, len(row)),
+            np.tile(columns, len(row)),
+            (scale * np.outer(row, row)).ravel(),
+        )
 
 
 def _iterate_rank_one_terms(model: Any, data: Any) -> Iterator[tuple[float, IntArray, FloatArray]]:
@@ -132,7 +138,9 @@ def _iterate_rank_one_terms(model: Any, data: Any) -> Iterator[tuple[float, IntA
 def _check_flex_stiffness(mj: Any, model: Any, data: Any) -> None:
     """Raise CapabilityError if a velocity of an elastic flex has no row of efm_K: MuJoCo then stores no matrix."""
     for flex in range(model.nflex):
-        is_elastic = _has_stiffness(model, flex, "stiffness") or _has_stiffness(model, flex, "bending")
+        is_elastic = _has_stiffness(model, flex, "stiffness") or _has_stiffness(
+            model, flex, "bending"
+        )
         if model.flex_rigid[flex] or not is_elastic:
             continue
         points, address, count = (

@@ -16,15 +16,28 @@ from lavender.base.arrays import IntArray, mark_read_only
 from lavender.base.errors import InputError
 from lavender_ext.io.mujoco_rows import ARRAYS, Step
 
-CHANGED_ADVICE = "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
+CHANGED_ADVICE = (
+    "MjData was changed since its forward pass, or belongs to another model: run mj_forward"
+)
 OTHER_MODEL_ADVICE = (
     "The model was changed, or MjData belongs to another model: give a model and data made from it"
 )
 # Sizes in bytes of the types of members; "*" is a pointer.
 TYPE_SIZES = {
-    "*": 8, "mjtNum": 8, "double": 8, "mjtSize": 8, "size_t": 8, "uintptr_t": 8, "uint64_t": 8, "int64_t": 8,
-    "int": 4, "float": 4, "mjtBool": 1, "mjtByte": 1, "char": 1,
-}  # fmt: skip
+    "*": 8,
+    "mjtNum": 8,
+    "double": 8,
+    "mjtSize": 8,
+    "size_t": 8,
+    "uintptr_t": 8,
+    "uint64_t": 8,
+    "int64_t": 8,
+    "int": 4,
+    "float": 4,
+    "mjtBool": 1,
+    "mjtByte": 1,
+    "char": 1,
+}
 # A model with rows in compressed form and several contacts, whose arrays are read in both ways.
 PROBE = """<mujoco><option jacobian="sparse"/><worldbody>
 <geom type="plane" size="1 1 .1"/><body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
@@ -92,7 +105,9 @@ def _make_step(model: Any, data: Any) -> Step:
     nv, bodies = model.nv, model.nbody
     sizes = (nv, nv, nv, nv, nv, len(model.M_colind), 6 * nv, 6 * bodies)
     if any(getattr(data, name).size != size for name, size in zip(ARRAYS, sizes, strict=False)):
-        raise InputError(f"the arrays of the MjData have other sizes than the model. {OTHER_MODEL_ADVICE}")
+        raise InputError(
+            f"the arrays of the MjData have other sizes than the model. {OTHER_MODEL_ADVICE}"
+        )
     kept = _MODELS.get(model) or _MODELS.setdefault(model, ModelCache(mj))
     step = _STEPS[data] = Step(model, data, kept, list_addresses)
     return step
@@ -109,9 +124,13 @@ def import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError:
-        raise InputError("mujoco cannot be imported; it has models and data: pip install mujoco") from None
+        raise InputError(
+            "mujoco cannot be imported; it has models and data: pip install mujoco"
+        ) from None
     if not hasattr(mujoco.MjModel, "M_rowadr"):
-        raise InputError(f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco")
+        raise InputError(
+            f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco"
+        )
     return mujoco
 
 
@@ -125,7 +144,8 @@ def find_layout(mj: Any) -> tuple[IntArray | None, tuple[int, ...]]:
     model = mj.MjModel.from_xml_string(PROBE)
     data = mj.MjData(model)
     mj.mj_forward(model, data)
-    contact, addresses = data.contact, list_addresses(data)
+    contact = data.contact
+    addresses = list_addresses(data)
     members = [_get_address(x) for x in (contact.dim, contact.geom, contact.friction)]
     layout = [address - members[0] for address in members] + [contact.dim.strides[0]]
     try:
@@ -139,7 +159,9 @@ def find_layout(mj: Any) -> tuple[IntArray | None, tuple[int, ...]]:
     addresses[-1] = stored[-1]  # The first contact begins before its dim.
     if not np.array_equal(stored, addresses) or not 0 <= members[0] - stored[-1] < layout[-1]:
         return None, tuple(layout)
-    return mark_read_only(offsets), tuple([x + members[0] - stored[-1] for x in layout[:3]] + layout[3:])
+    return mark_read_only(offsets), tuple(
+        [x + members[0] - stored[-1] for x in layout[:3]] + layout[3:]
+    )
 
 
 @cache
@@ -155,7 +177,8 @@ def _count_size_bytes(mj: Any) -> int:
     model = mj.MjModel.from_xml_string(PROBE)
     names = "nq", "nv", "ngeom", "nbuffer"
     is_same = all(
-        ctypes.c_int32.from_address(model._address + places[x]).value == getattr(model, x) for x in names
+        ctypes.c_int32.from_address(model._address + places[x]).value == getattr(model, x)
+        for x in names
     )
     return count if is_same else 0
 
@@ -178,7 +201,9 @@ def _get_address(array: Any) -> int:
 
 def _lay_out(structs: Any, name: str) -> tuple[dict[str, int], int, int]:
     """Return the offset of each member of a C struct [bytes], then its size and alignment."""
-    members, end, alignment = {}, 0, 1
+    members = {}
+    end = 0
+    alignment = 1
     for field in structs[name].fields:
         text = str(field.type)
         kind = "*" if "*" in text else text.replace("const ", "").split(" ")[0]
@@ -186,6 +211,8 @@ def _lay_out(structs: Any, name: str) -> tuple[dict[str, int], int, int]:
         if not size:
             _, size, align = _lay_out(structs, kind)
         members[field.name] = -(-end // align) * align
-        end = members[field.name] + size * int(np.prod([int(x) for x in re.findall(r"\[(\d+)\]", text)]))
+        end = members[field.name] + size * int(
+            np.prod([int(x) for x in re.findall(r"\[(\d+)\]", text)])
+        )
         alignment = max(alignment, align)
     return members, -(-end // alignment) * alignment, alignment

@@ -56,13 +56,18 @@ def from_newton_mujoco(solver: Any, velocity: Any) -> EngineStep:
     try:
         return _convert_solver_arrays(solver, data, model, to_numpy("velocity", velocity))
     except AttributeError as error:
-        raise CapabilityError(f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}") from None
+        raise CapabilityError(
+            f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}"
+        ) from None
 
 
 def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) -> EngineStep:
     """Read the engine's arrays and build the batch."""
-    rows, contact, count = data.nefc.numpy().astype(np.int64), data.contact, int(data.nacon.numpy()[0])
-    capacity, nv = int(data.efc.D.shape[1]), int(model.nv)
+    rows = data.nefc.numpy().astype(np.int64)
+    contact = data.contact
+    count = int(data.nacon.numpy()[0])
+    capacity = int(data.efc.D.shape[1])
+    nv = int(model.nv)
     jac = data.efc.J.numpy()
     if jac.ndim != 3 or jac.shape[1] < capacity or jac.shape[2] < nv:
         raise CapabilityError(
@@ -77,17 +82,27 @@ def _convert_solver_arrays(solver: Any, data: Any, model: Any, velocity: Any) ->
     dropped_contacts = max(count - len(contact.dim), 0)
     count -= dropped_contacts
     world, address, dim, friction = (
-        getattr(contact, name).numpy()[:count] for name in ("worldid", "efc_address", "dim", "friction")
+        getattr(contact, name).numpy()[:count]
+        for name in ("worldid", "efc_address", "dim", "friction")
     )
     mass = data.M.numpy()
     if mass.ndim == 2:  # M is given as lower triangles in compressed rows.
-        mass = mass[:, : len(model.M_colind)], model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+        mass = (
+            mass[:, : len(model.M_colind)],
+            model.M_colind,
+            np.append(model.M_rowadr, len(model.M_colind)),
+        )
     else:
         mass = mass[:, :nv, :nv]
     result = from_efc(
-        efc_J=jac[:, :m, :nv].copy(), M=mass, qvel=velocity.astype(jac.dtype), **arrays, nefc=used,
-        timestep=solver.mjw_model.opt.timestep.numpy(), contacts=(world, address[:, 0], dim, friction),
-    )  # fmt: skip
+        efc_J=jac[:, :m, :nv].copy(),
+        M=mass,
+        qvel=velocity.astype(jac.dtype),
+        **arrays,
+        nefc=used,
+        timestep=solver.mjw_model.opt.timestep.numpy(),
+        contacts=(world, address[:, 0], dim, friction),
+    )
     assert result.impulse is not None
     iterations = data.solver_niter.numpy().astype(np.int64)
     limit = int(np.max(to_numpy("iterations", solver.mjw_model.opt.iterations)))

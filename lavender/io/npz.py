@@ -121,12 +121,15 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         operator = "csr"
         arrays |= _split_matrix("A", problem.matrix)
     else:
-        operator, arrays["A"] = "dense", problem.matrix
+        operator = "dense"
+        arrays["A"] = problem.matrix
     stored = {
-        "compliance": problem.compliance, "guess": problem.guess, "key": problem.key,
+        "compliance": problem.compliance,
+        "guess": problem.guess,
+        "key": problem.key,
         "angular": None if problem.angular is None else problem.angular.astype(np.int8),
         "impulse": None if impulse is None else problem.make_start(impulse),
-    }  # fmt: skip
+    }
     arrays |= {name: x for name, x in stored.items() if x is not None}
     names = None if problem.names is None else list(problem.names)
     meta: dict[str, Any] = {"operator": operator, "friction": problem.friction}
@@ -163,8 +166,12 @@ def _read_own_format(archive: Arrays) -> Stored:
     for name in archive:
         if archive[name].dtype.kind not in "iuf":
             raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
-    parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key", "angular") if name in archive}
-    parts |= {name: meta[name] for name in ("friction", "names", "name", "precision") if name in meta}
+    parts: dict[str, Any] = {
+        name: archive[name] for name in ("guess", "key", "angular") if name in archive
+    }
+    parts |= {
+        name: meta[name] for name in ("friction", "names", "name", "precision") if name in meta
+    }
     if meta["operator"] in ("rows", "generalized") or (
         meta["operator"] == "program" and "compliance" in archive
     ):
@@ -177,7 +184,9 @@ def _read_own_format(archive: Arrays) -> Stored:
     if b.ndim != 1 or ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
     if meta["operator"] == "rows":
-        fields_of_rows: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
+        fields_of_rows: dict[str, Any] = {
+            name.removeprefix("rows_"): archive[name] for name in ROWS
+        }
         parts["rows"] = Rows(**fields_of_rows)
     elif meta["operator"] == "generalized":
         v_free = archive["general_v_free"]
@@ -193,7 +202,8 @@ def _read_own_format(archive: Arrays) -> Stored:
     if "moved_by" in meta:
         moved = _read_vector(archive, "engine_impulse", problem)
         moved = impulse if moved is None else moved
-        moved_by, general = meta["moved_by"], problem.generalized
+        moved_by = meta["moved_by"]
+        general = problem.generalized
         if general is None or moved is None or moved_by not in MOVERS:
             raise InputError(
                 f"entry 'meta': moved_by is {moved_by!r:.60}; {' or '.join(MOVERS)} is needed, in generalised "
@@ -204,7 +214,9 @@ def _read_own_format(archive: Arrays) -> Stored:
             for name, n in zip(MOTION, (general.nv, problem.m, general.nv), strict=True)
             if name in archive or name in MOTION[:2]
         )
-        problem.__dict__["engine_motion"] = EngineMotion(moved, change, compliance, moved_by, *momentum)
+        problem.__dict__["engine_motion"] = EngineMotion(
+            moved, change, compliance, moved_by, *momentum
+        )
     return Stored(problem, "lavender", impulse=impulse)
 
 
@@ -219,9 +231,13 @@ def _read_meta(archive: Arrays) -> dict[str, Any]:
         ) from None
     needed = ("operator", "friction", "name", "names")
     if missing := [name for name in needed if not isinstance(meta, dict) or name not in meta]:
-        raise InputError(f"entry 'meta' has no {', '.join(missing)}; a JSON object with them is needed")
+        raise InputError(
+            f"entry 'meta' has no {', '.join(missing)}; a JSON object with them is needed"
+        )
     if meta["operator"] not in FORMS:
-        raise InputError(f"entry 'meta' has operator {meta['operator']!r}; {', '.join(FORMS)} are known")
+        raise InputError(
+            f"entry 'meta' has operator {meta['operator']!r}; {', '.join(FORMS)} are known"
+        )
     return meta
 
 
@@ -234,9 +250,12 @@ def _read_program(archive: Arrays, **more: Any) -> Problem:
     n = archive["q"].size
     for name, side in (("P", "q"), ("G", "h"), ("A", "b")):
         if f"{name}_shape" in archive:
-            m, shape = archive[side].size, tuple(archive[f"{name}_shape"].ravel().tolist())
+            m = archive[side].size
+            shape = tuple(archive[f"{name}_shape"].ravel().tolist())
             if shape != (m, n):
-                raise InputError(f"{name}_shape is {shape}; ({m}, {n}) is needed, as {side} has {m} entries")
+                raise InputError(
+                    f"{name}_shape is {shape}; ({m}, {n}) is needed, as {side} has {m} entries"
+                )
             arrays[name] = _read_compressed(archive, name, n, m).T
     arrays.setdefault("P", sp.csr_array((n, n)))
     return Problem.from_qp(**arrays, **more)
@@ -247,18 +266,30 @@ def _read_program(archive: Arrays, **more: Any) -> Problem:
 
 def _build_box_cones(archive: Arrays, m: int) -> Cones:
     """Build the cones of the box format from bounds and, if given, contacts of 1 to 3 rows."""
-    lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
+    lower, upper = (
+        as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi")
+    )
     if "cone_start" not in archive or archive["cone_start"].size == 0:
         return Cones.bounded(lower, upper)
     count = archive["cone_start"].size
     start, size, mu = (
         as_array(f"entry {name!r}", archive[name], (count,), dtype=dtype)
-        for name, dtype in (("cone_start", np.int32), ("cone_dim", np.int32), ("cone_mu", np.float64))
+        for name, dtype in (
+            ("cone_start", np.int32),
+            ("cone_dim", np.int32),
+            ("cone_mu", np.float64),
+        )
     )
     order = np.argsort(start)
     start, size, mu = start[order], size[order], mu[order]
     end = start.astype(np.int64) + size
-    if size.min() < 1 or size.max() > 3 or start.min() < 0 or end.max() > m or np.any(end[:-1] > start[1:]):
+    if (
+        size.min() < 1
+        or size.max() > 3
+        or start.min() < 0
+        or end.max() > m
+        or np.any(end[:-1] > start[1:])
+    ):
         raise InputError(
             f"cones have sizes {size.min()} to {size.max()}, from row {start.min()} to {end.max() - 1}; cone_start "
             f"and cone_dim of cones of 1 to 3 rows that do not overlap, within rows 0 to {m - 1}, are needed"
@@ -266,13 +297,19 @@ def _build_box_cones(archive: Arrays, m: int) -> Cones:
     # All rows but the later ones of cones are the first of a block.
     later = [np.arange(s + 1, e) for s, e in zip(start, end, strict=True)]
     first = np.setdiff1d(np.arange(m), np.concatenate(later))
-    contact, friction = np.zeros(len(first), bool), np.zeros(len(first))
+    contact = np.zeros(len(first), bool)
+    friction = np.zeros(len(first))
     at = np.searchsorted(first, start)
-    contact[at], friction[at] = True, mu
+    contact[at] = True
+    friction[at] = mu
     return Cones(
-        ptr=np.append(first, m), kind=get_block_kinds(contact), lower=lower, upper=upper, mu=friction,
+        ptr=np.append(first, m),
+        kind=get_block_kinds(contact),
+        lower=lower,
+        upper=upper,
+        mu=friction,
         patch_radius=np.zeros(len(first)),
-    )  # fmt: skip
+    )
 
 
 def _read_vector(archive: Arrays, name: str, problem: Problem) -> FloatArray | None:
@@ -300,7 +337,11 @@ def build_checked_csr(
     indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int
 ) -> sp.csr_array:
     """Build a CSR matrix (m, n) from arrays of a file, with checked indices; arrays may be longer than needed."""
-    for name, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
+    for name, x, kinds in (
+        ("pointers", indptr, "iu"),
+        ("indices", indices, "iu"),
+        ("values", data, "buif"),
+    ):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(
                 f"the {name} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
@@ -308,7 +349,9 @@ def build_checked_csr(
             )
     used = int(indptr[-1]) if len(indptr) else 0
     try:
-        if np.any(indptr[1:] < indptr[:-1]):  # SciPy does not test this if the matrix has no entries.
+        if np.any(
+            indptr[1:] < indptr[:-1]
+        ):  # SciPy does not test this if the matrix has no entries.
             raise ValueError("pointers decrease")
         matrix = sp.csr_array((data[:used].astype(float), indices[:used], indptr), shape=(m, n))
         matrix.check_format(full_check=True)

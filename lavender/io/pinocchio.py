@@ -99,17 +99,19 @@ def from_pinocchio(
     try:
         import pinocchio as pin
     except ImportError:
-        raise InputError("pinocchio cannot be imported: pip install pin, which provides models") from None
+        raise InputError(
+            "pinocchio cannot be imported: pip install pin, which provides models"
+        ) from None
     for word, sequence in (("models", constraint_models), ("data", constraint_datas)):
         if not (hasattr(sequence, "__len__") and hasattr(sequence, "__iter__")):
-            raise InputError(f"constraint {word}: got a {type(sequence).__name__}; a sequence is needed")
+            raise InputError(
+                f"constraint {word}: got a {type(sequence).__name__}; a sequence is needed"
+            )
     n_models, n_datas = len(constraint_models), len(constraint_datas)
     if n_models != n_datas:
         raise InputError(f"{n_datas} constraint data for {n_models} models; one for each is needed")
-    dt, correction = (
-        check_float("dt", dt, above=0.0),
-        check_float("correction", correction, low=0.0, high=1.0),
-    )
+    dt = check_float("dt", dt, above=0.0)
+    correction = check_float("correction", correction, low=0.0, high=1.0)
     _check_model(pin, model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
@@ -123,7 +125,9 @@ def from_pinocchio(
     with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
-        data.q_in = q  # Pinocchio evaluates joint limits at q_in, which none of its algorithms sets.
+        data.q_in = (
+            q  # Pinocchio evaluates joint limits at q_in, which none of its algorithms sets.
+        )
     pairs = zip(constraint_models, constraint_datas, strict=True)
     rows, target, cones, names, angular = _convert_constraints(model, data, pairs, dt, correction)
     if level == "acceleration":
@@ -133,24 +137,39 @@ def from_pinocchio(
                 f"level is 'acceleration' and there is a {min(kinds - ANCHORS)}; only anchors have an acceleration "
                 "level: give level='velocity' for contacts, limits and friction"
             )
-        target = rows @ v - dt * _differentiate_constraint_velocity(pin, model, constraint_models, q, v)
+        target = rows @ v - dt * _differentiate_constraint_velocity(
+            pin, model, constraint_models, q, v
+        )
     return Problem.from_jacobian(
-        rows, mass, v + dt * a, target=target, cones=cones, compliance=compliance, friction=friction, names=names,
-        angular=angular, name=name,
-    )  # fmt: skip
+        rows,
+        mass,
+        v + dt * a,
+        target=target,
+        cones=cones,
+        compliance=compliance,
+        friction=friction,
+        names=names,
+        angular=angular,
+        name=name,
+    )
 
 
-def _differentiate_constraint_velocity(pin: Any, model: Any, constraints: Any, q: Any, v: Any) -> Any:
+def _differentiate_constraint_velocity(
+    pin: Any, model: Any, constraints: Any, q: Any, v: Any
+) -> Any:
     """Return (dJ/dt) v (m,): the central difference of J(q) v along v."""
     # The step in which the error of the difference and its rounding are equal.
     h = np.cbrt(np.finfo(float).eps) / max(1.0, float(np.abs(v).max(initial=0.0)))
     speeds = []
     for step in (h, -h):
-        data, moved = model.createData(), pin.integrate(model, q, step * v)
+        data = model.createData()
+        moved = pin.integrate(model, q, step * v)
         pin.forwardKinematics(model, data, moved, v)
         pin.computeJointJacobians(model, data, moved)
         data.q_in = moved
-        pairs = [(constraint, _unwrap_constraint(constraint).createData()) for constraint in constraints]
+        pairs = [
+            (constraint, _unwrap_constraint(constraint).createData()) for constraint in constraints
+        ]
         speeds.append(_convert_constraints(model, data, pairs, 1.0, 0.0)[0] @ v)
     return (speeds[0] - speeds[1]) / (2.0 * h)
 
@@ -162,9 +181,14 @@ def _convert_constraints(
     nv = int(model.nv)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
-    cones, names, angular, rotates = Cones.free(0), [], [], np.zeros(nv, bool)
+    cones = Cones.free(0)
+    names = []
+    angular = []
+    rotates = np.zeros(nv, bool)
     for joint in list(model.joints)[1:]:  # Mark the angular velocities of the model [rad/s].
-        name, first, count = joint.shortname().removeprefix("JointModel"), int(joint.idx_v), int(joint.nv)
+        name = joint.shortname().removeprefix("JointModel")
+        first = int(joint.idx_v)
+        count = int(joint.nv)
         is_angular = name.startswith(("R", "Spherical", "Universal", "Helical", "H"))
         begin = 0 if is_angular else {"FreeFlyer": 3, "Planar": 2}.get(name, count)
         rotates[first + begin : first + count] = True
@@ -178,7 +202,9 @@ def _convert_constraints(
                 f"Pinocchio's impulses would be bounded for {own:g} s. Call setTimeStep({dt:g}) on the constraint model"
             )
         with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
-            data_of = model_of.createData()  # Data of the caller could have the sizes of another model.
+            data_of = (
+                model_of.createData()
+            )  # Data of the caller could have the sizes of another model.
             model_of.calc(model, data, data_of)
             jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
         own_cones, target, order = _convert_constraint(model_of, data_of, len(jac), dt, correction)
@@ -280,17 +306,27 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
     """Check that the joints of constraint i belong to this model and its data to its kind."""
     kind = type(constraint).__name__
     if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
-        raise InputError(f"constraint model {i} is a {kind}; a constraint model of Pinocchio is needed")
+        raise InputError(
+            f"constraint model {i} is a {kind}; a constraint model of Pinocchio is needed"
+        )
     if type(data).__name__ != kind.replace("Model", "Data"):
-        raise InputError(f"constraint data {i} are a {type(data).__name__}; the data of a {kind} are needed")
+        raise InputError(
+            f"constraint data {i} are a {type(data).__name__}; the data of a {kind} are needed"
+        )
     for name in ("joint1_placement", "joint2_placement"):
         if hasattr(constraint, name) and not _is_rotation(getattr(constraint, name).rotation):
-            raise InputError(f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation")
+            raise InputError(
+                f"constraint {i}, a {kind}: {name} has a matrix that is not a rotation"
+            )
     if kind == "FrameAnchorConstraintModel" and np.any(constraint.desired_constraint_offset):
         raise CapabilityError(
             f"constraint {i}, a {kind}, has a desired offset, which Pinocchio does not read: put it into a placement"
         )
-    joints = [getattr(constraint, name) for name in ("joint1_id", "joint2_id") if hasattr(constraint, name)]
+    joints = [
+        getattr(constraint, name)
+        for name in ("joint1_id", "joint2_id")
+        if hasattr(constraint, name)
+    ]
     for name in ("getSelectedJoints", "getActiveJoints"):
         if hasattr(constraint, name):
             joints += list(getattr(constraint, name)())
@@ -340,7 +376,9 @@ def _convert_constraint(
     if kind == "JointFrictionConstraintModel":
         low, high = np.array(model.getFrictionLowerLimit()), np.array(model.getFrictionUpperLimit())
         return Cones.bounded(dt * low, dt * high), np.zeros(n), order
-    raise CapabilityError(f"a {kind} is not supported; anchors, points, joint limits and joint friction are")
+    raise CapabilityError(
+        f"a {kind} is not supported; anchors, points, joint limits and joint friction are"
+    )
 
 
 def compute_target_velocity(gap: Any, dt: float, correction: float) -> Any:

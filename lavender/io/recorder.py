@@ -47,13 +47,20 @@ from lavender.problem import Problem
 def describe_answer(problem: Problem, impulse: Any, threshold: float) -> dict[str, Any]:
     """Return the entries of a line of `engine.jsonl` that follow from a problem and the engine's impulse (m,) [N s]."""
     judged = residual(problem, impulse, threshold=threshold)
-    return {
-        "rows": problem.m, "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_label,
-        "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": problem.precision,
-        "threshold": threshold,
-    } | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {}) | (
-        {"moved_by": judged.moved_by} if judged.moved_by != "impulse" else {}
-    )  # fmt: skip
+    return (
+        {
+            "rows": problem.m,
+            "relative": judged.relative,
+            "velocity": judged.velocity,
+            "worst": judged.worst_label,
+            "floor": judged.roundoff_floor,
+            "verdict": judged.verdict,
+            "precision": problem.precision,
+            "threshold": threshold,
+        }
+        | ({"lost_digits": judged.lost_digits} if judged.lost_digits else {})
+        | ({"moved_by": judged.moved_by} if judged.moved_by != "impulse" else {})
+    )
 
 
 @dataclass(frozen=True)
@@ -134,14 +141,22 @@ class Recorder:
         if when is not None and not callable(when):
             raise InputError(f"when is {when!r:.60}; a function of a StepVerdict is needed")
         if self.every is None and not self.keep_worst and when is None:
-            raise InputError("no condition selects steps to record: give every=, keep_worst= or when=")
-        self.when, self.solver, self.n_steps = when, solver, 0
+            raise InputError(
+                "no condition selects steps to record: give every=, keep_worst= or when="
+            )
+        self.when = when
+        self.solver = solver
+        self.n_steps = 0
         self.folder = prepare_step_folder(folder, replace)
         self.lines: dict[str, dict[str, Any]] = {}  # Lines of `engine.jsonl` by file.
         # Heap of (velocity error, file) with the smallest error first.
         self._worst: list[tuple[float, str]] = []
-        self._unjudged: set[int] = set()  # Worlds with a line about their first step that cannot be judged.
-        self._removed: list[str] = []  # Files without a line, to be deleted after the lines are written.
+        self._unjudged: set[int] = (
+            set()
+        )  # Worlds with a line about their first step that cannot be judged.
+        self._removed: list[
+            str
+        ] = []  # Files without a line, to be deleted after the lines are written.
         self._is_closed = False
         self._has_warned = False  # Of a step that differs from its prediction.
 
@@ -220,20 +235,28 @@ class Recorder:
             impulse, left_over = reconstruct(problems, velocity)
             facts |= {"reconstructed": True, "left_over": left_over}
         if impulse is None:
-            raise InputError("impulse is missing: give the engine's answer [N s] to judge, or velocity=")
+            raise InputError(
+                "impulse is missing: give the engine's answer [N s] to judge, or velocity="
+            )
         verdicts, reasons = self._judge_worlds(problems, impulse, claims)
         states = self._split_states(state, len(verdicts), isinstance(problems, Problem))
         changed = False
         for verdict in verdicts:
             reason = reasons.get(verdict.world, "")
-            changed |= self._record_selected_world(verdict, problems, impulse, claims, states, reason, facts)
+            changed |= self._record_selected_world(
+                verdict, problems, impulse, claims, states, reason, facts
+            )
         if changed or self._removed:
             self.write_lines()
         self.n_steps += 1
         return verdicts
 
     def write_step(
-        self, line: dict[str, Any], problem: Problem, impulse: Any, state: Mapping[str, Any] | None = None
+        self,
+        line: dict[str, Any],
+        problem: Problem,
+        impulse: Any,
+        state: Mapping[str, Any] | None = None,
     ) -> None:
         """Write the files of a step, and add its line; Ctrl-C leaves no file without a line."""
         path = self.folder / line["file"]
@@ -252,7 +275,9 @@ class Recorder:
 
     def write_lines(self) -> None:
         """Write `engine.jsonl`, then delete the files that no longer have a line."""
-        write_text(self.folder / ENGINE, "".join(f"{format_json(line)}\n" for line in self.lines.values()))
+        write_text(
+            self.folder / ENGINE, "".join(f"{format_json(line)}\n" for line in self.lines.values())
+        )
         for name in self._removed:
             for path in (self.folder / name, self.folder / STATES_FOLDER / name):
                 path.unlink(missing_ok=True)
@@ -264,7 +289,9 @@ class Recorder:
         """Return the verdict of each world, and the reasons why worlds could not be judged."""
         if isinstance(problems, Problem):
             own = residual(problems, impulse, threshold=self.threshold)
-            rows, numbers, reasons = [problems.m], [(own.velocity, own.relative, own.verdict)], {}
+            rows = [problems.m]
+            numbers = [(own.velocity, own.relative, own.verdict)]
+            reasons = {}
         elif isinstance(problems, Batch):
             many = residual_many(problems, impulse, threshold=self.threshold, errors="status")
             rows = problems.row_counts.tolist()
@@ -286,7 +313,9 @@ class Recorder:
             )
         claimed = [None] * len(rows) if claims is None else claims.converged.tolist()
         verdicts = [
-            StepVerdict(self.n_steps, i, rows[i], *numbers[i], claimed=claimed[i], prediction_gap=gap)
+            StepVerdict(
+                self.n_steps, i, rows[i], *numbers[i], claimed=claimed[i], prediction_gap=gap
+            )
             for i in range(len(rows))
         ]
         return verdicts, reasons
@@ -298,12 +327,18 @@ class Recorder:
         if state is None:
             return None
         names = state if isinstance(state, Mapping) else [""]
-        if not all(isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in names):
-            raise InputError(f"state is {state!r:.60}; a dict of arrays, names without / and \\, is needed")
+        if not all(
+            isinstance(name, str) and name and not set(name) & {"/", "\\", "\0"} for name in names
+        ):
+            raise InputError(
+                f"state is {state!r:.60}; a dict of arrays, names without / and \\, is needed"
+            )
         arrays = {name: np.asarray(to_numpy(f"state {name!r}", x)) for name, x in state.items()}
         for name, x in arrays.items():
             if x.dtype.hasobject:
-                raise InputError(f"state {name!r} holds objects ({x.dtype}); numbers or texts are needed")
+                raise InputError(
+                    f"state {name!r} holds objects ({x.dtype}); numbers or texts are needed"
+                )
         if is_single:
             return lambda i: arrays
         for name, x in arrays.items():
@@ -333,9 +368,11 @@ class Recorder:
             self._unjudged.add(i)
             self.leave_out(line, reason)
             return True
-        is_worst = self.keep_worst > 0 and verdict.rows > 0 and (
-            len(self._worst) < self.keep_worst or error > self._worst[0][0]
-        )  # fmt: skip
+        is_worst = (
+            self.keep_worst > 0
+            and verdict.rows > 0
+            and (len(self._worst) < self.keep_worst or error > self._worst[0][0])
+        )
         if not (is_selected or is_worst) or verdict.rows == 0:
             return False
         is_single = isinstance(problems, Problem)
@@ -346,8 +383,13 @@ class Recorder:
             facts: dict[str, Any] = {"solver": self.solver, **more}
             facts |= describe_answer(problem, own, self.threshold)
             if claims is not None:
-                facts["claimed"], facts["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
-                facts["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
+                facts["claimed"], facts["iterations"] = (
+                    bool(claims.converged[i]),
+                    int(claims.iterations[i]),
+                )
+                facts["claimed_residuals"] = {
+                    key: float(x[i]) for key, x in claims.residuals.items()
+                }
             if verdict.prediction_gap > 0.0:
                 facts["prediction_gap"] = verdict.prediction_gap
             if is_selected:

@@ -17,7 +17,13 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import read_step
 from lavender.io.recorder import Recorder, describe_answer
-from lavender.io.start_states import Control, load_controls, load_model, make_controller, read_states
+from lavender.io.start_states import (
+    Control,
+    load_controls,
+    load_model,
+    make_controller,
+    read_states,
+)
 from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.problem import PRECISIONS, Problem
 
@@ -50,7 +56,9 @@ class Recording:
     @property
     def left_out(self) -> tuple[str, ...]:
         """Reasons why steps could not be exported, one line each."""
-        return tuple(f"step {line['step']}: {line['left_out']}" for line in self.lines if "left_out" in line)
+        return tuple(
+            f"step {line['step']}: {line['left_out']}" for line in self.lines if "left_out" in line
+        )
 
     def __str__(self) -> str:
         judged = [line for line in self.lines if "left_out" not in line]
@@ -141,7 +149,9 @@ def record(
     threshold = check_float("threshold", threshold, low=0.0)
     control_at = make_controller(model, control, seed)
     starts = None if states is None else read_states(mj, model, states).select_evenly(steps)
-    without, is_interrupted, width = 0, False, len(str(steps))
+    without = 0
+    is_interrupted = False
+    width = len(str(steps))
     with Recorder(folder, every=1, threshold=threshold, replace=replace) as recorder:
         try:
             for step, start in iterate_steps(mj, model, data, steps, every, control_at, starts):
@@ -166,7 +176,13 @@ def record(
 
 
 def iterate_steps(
-    mj: Any, model: Any, data: Any, steps: int, every: int, control_at: Callable[..., Any], starts: Any
+    mj: Any,
+    model: Any,
+    data: Any,
+    steps: int,
+    every: int,
+    control_at: Callable[..., Any],
+    starts: Any,
 ) -> Iterator[tuple[int, int]]:
     """Step a simulation; yield the numbers of every `every`-th step and of its start state.
 
@@ -179,7 +195,8 @@ def iterate_steps(
     for step in range(steps):
         try:
             if step in firsts:
-                i, first = firsts[step], step
+                i = firsts[step]
+                first = step
                 mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
             elif firsts:
                 mj.mj_step(model, data)  # From the previous constraints, under their controls.
@@ -206,7 +223,8 @@ def _solve_step(
     Return the problem, MuJoCo's impulse (m,) [N s], and the record of both; None without constraints.
     """
     # The same solve from the same warm start, without noslip, has the iterations of the solver alone.
-    noslip, iterations = int(model.opt.noslip_iterations), None
+    noslip = int(model.opt.noslip_iterations)
+    iterations = None
     if noslip > 0:
         model.opt.noslip_iterations = 0
         try:
@@ -225,10 +243,11 @@ def _solve_step(
     problem = dataclasses.replace(problem, precision=precision, copy=False)
     impulse = adapter.impulse(model, data)
     facts = describe_answer(problem, impulse, threshold) | {
-        "iterations": iterations, "seconds": seconds,
+        "iterations": iterations,
+        "seconds": seconds,
         "noslip_iterations": None if iterations is None or total is None else total - iterations,
         "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
-    }  # fmt: skip
+    }
     return problem, impulse, facts
 
 
@@ -247,7 +266,9 @@ def record_file(
 ) -> Recording:
     """Call `record` for a model file (MJCF); an array of controls may also be given as a file (.npy)."""
     mj, model = load_model(path)
-    result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
+    result = record(
+        model, mj.MjData(model), folder, steps, control=load_controls(control), **options
+    )
     if not result.files:
         every = options.get("every", 1)
         why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"

@@ -32,15 +32,33 @@ MODEL_SUFFIXES = (".xml", ".mjb")  # Suffixes of files with a model of MuJoCo.
 VECTOR = "state"
 NEEDED = ("qpos", "qvel")
 OPTIONAL = (
-    "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
+    "act",
+    "ctrl",
+    "qacc_warmstart",
+    "time",
+    "mocap_pos",
+    "mocap_quat",
+    "userdata",
+    "eq_active",
+    "qfrc_applied",
     "xfrc_applied",
-)  # fmt: skip
+)
 # Additional arrays in the files of `lavender audit`: the origin of each state.
 LABELS = ("world", "step", "model", "mujoco")
 # Arrays of a model with these prefixes determine the motion; together with a state they define a step's problem.
 MODEL_ARRAYS = (
-    "body_", "jnt_", "dof_", "geom_", "eq_", "tendon_", "wrap_", "actuator_", "pair_", "flex_", "qpos",
-)  # fmt: skip
+    "body_",
+    "jnt_",
+    "dof_",
+    "geom_",
+    "eq_",
+    "tendon_",
+    "wrap_",
+    "actuator_",
+    "pair_",
+    "flex_",
+    "qpos",
+)
 APPEARANCE = ("rgba", "matid", "user", "group", "plugin")  # Arrays with these words do not.
 
 
@@ -55,7 +73,9 @@ def load_model(source: Any) -> tuple[Any, Any]:
         )
     path = str(as_path(source))
     if Path(path).suffix.lower() in SUFFIXES:
-        raise InputError(f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed")
+        raise InputError(
+            f"{path} has the suffix of a problem file; a model of MuJoCo (MJCF) is needed"
+        )
     is_binary = Path(path).suffix.lower() == ".mjb"
     try:
         read = mj.MjModel.from_binary_path if is_binary else mj.MjModel.from_xml_path
@@ -102,7 +122,9 @@ def load_controls(control: Control) -> Control:
     return result
 
 
-def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+def make_controller(
+    model: Any, control: Control, seed: int
+) -> Callable[[Any, int], FloatArray | None]:
     """Return a function (data, step) -> controls (nu,) or None; see `record`."""
     n = int(model.nu)
     if callable(control):
@@ -115,7 +137,9 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
         return called
     if isinstance(control, str):
         if control not in CONTROLS:
-            raise InputError(f"control is {control!r}; {', '.join(CONTROLS)}, an array or function is needed")
+            raise InputError(
+                f"control is {control!r}; {', '.join(CONTROLS)}, an array or function is needed"
+            )
         if control == "zero":
             return lambda data, step: np.zeros(n)
         if control == "hold":
@@ -126,7 +150,9 @@ def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, i
         return lambda data, step: rng.uniform(low, high)
     rows = as_array("control", control, (None, n))
     if len(rows) == 0:
-        raise InputError(f"control has shape {rows.shape}; (any, {n}) with at least one row is needed")
+        raise InputError(
+            f"control has shape {rows.shape}; (any, {n}) with at least one row is needed"
+        )
     return lambda data, step: rows[step % len(rows)]
 
 
@@ -135,7 +161,9 @@ class StartStates:
     """States in which simulations start."""
 
     vectors: FloatArray  # (n, size): state vectors of mjSTATE_INTEGRATION, as `mj_getState` returns them.
-    controls: FloatArray | None = None  # (n, nu): controls of the first step; None if the source has none.
+    controls: FloatArray | None = (
+        None  # (n, nu): controls of the first step; None if the source has none.
+    )
     # Quantities on which a step depends and that arrays of states lack: "warm start", "controls".
     missing: tuple[str, ...] = ()
     misfit: str = ""  # Sentence on states that do not fit the model; else empty.
@@ -193,7 +221,8 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     if isinstance(source, str) and source == KEYFRAMES:
         if not model.nkey:
             raise InputError("states are 'keyframes', and the model has none; a keyframe is needed")
-        data, vectors = mj.MjData(model), []
+        data = mj.MjData(model)
+        vectors = []
         for key in range(model.nkey):
             mj.mj_resetDataKeyframe(model, data, key)
             vectors.append(_read_state_vector(mj, model, data))
@@ -229,7 +258,9 @@ def check_array_names(source: str, names: Iterable[str], valid: Iterable[str]) -
     valid = tuple(valid)
     for name in names:
         if name not in (*valid, *LABELS):
-            raise InputError(f"{source} has an array {name!r}; the arrays of a state are {', '.join(valid)}")
+            raise InputError(
+                f"{source} has an array {name!r}; the arrays of a state are {', '.join(valid)}"
+            )
 
 
 def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) -> StartStates:
@@ -254,7 +285,9 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
         sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(f"{source} holds unequal or no states: {sizes}; one number above 0 is needed")
+        raise InputError(
+            f"{source} holds unequal or no states: {sizes}; one number above 0 is needed"
+        )
     vectors = []
     for i in range(n):
         data = mj.MjData(model)
@@ -272,10 +305,14 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) ->
 def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
     """Build states from vectors (n, size) of mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION."""
     integration = mj.mjtState.mjSTATE_INTEGRATION
-    kinds = {mj.mj_stateSize(model, kind): kind for kind in
-             (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, integration)}  # fmt: skip
+    kinds = {
+        mj.mj_stateSize(model, kind): kind
+        for kind in (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, integration)
+    }
     states = np.asarray(states)
-    states = as_array(f"{source}: {VECTOR}", states[None] if states.ndim == 1 else states, (None, None))
+    states = as_array(
+        f"{source}: {VECTOR}", states[None] if states.ndim == 1 else states, (None, None)
+    )
     n, size = states.shape
     if size not in kinds or n == 0:
         raise InputError(
@@ -290,7 +327,9 @@ def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
         controls.append(np.array(data.ctrl))
     if kinds[size] == integration:
         return StartStates(np.array(vectors), np.array(controls))
-    return StartStates(np.array(vectors), missing=("warm start", *(("controls",) if model.nu else ())))
+    return StartStates(
+        np.array(vectors), missing=("warm start", *(("controls",) if model.nu else ()))
+    )
 
 
 def _read_state_vector(mj: Any, model: Any, data: Any) -> FloatArray:

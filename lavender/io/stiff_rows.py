@@ -28,7 +28,9 @@ MAX_EXAMINED_COMPLIANCE = 1e-4
 MIN_COMPLIANCE_RATIO = 2.0**-34
 # [-] Rows with compliances up to this factor above the smallest one keep their weights against each other.
 MAX_COMPLIANCE_SPAN = 2.0**8
-MAX_RAISED_RATIO = 2.0**-10  # [-] Largest R / d of a raised row, which a row with a small d would exceed.
+MAX_RAISED_RATIO = (
+    2.0**-10
+)  # [-] Largest R / d of a raised row, which a row with a small d would exceed.
 
 
 def raise_compliance(problem: Problem) -> FloatArray | None:
@@ -73,7 +75,8 @@ def make_engine_batch(
         See `EngineMotion`.
     """
     batch = make_batch(compliance)
-    engine, raised = compliance.reshape(-1), compliance.reshape(-1).copy()
+    engine = compliance.reshape(-1)
+    raised = compliance.reshape(-1).copy()
     stiff = set()
     for i in range(len(batch)) if engine.min(initial=np.inf) < MAX_EXAMINED_COMPLIANCE else ():
         rows = batch.rows_of(i)
@@ -90,5 +93,7 @@ def make_engine_batch(
             rows = batch.rows_of(i)
             if rows.stop > rows.start:
                 own = None if momentum is None else momentum[i]
-                batch.engine_motions[i] = EngineMotion(flat[rows], change[i], engine[rows], moved_by, own)
+                batch.engine_motions[i] = EngineMotion(
+                    flat[rows], change[i], engine[rows], moved_by, own
+                )
     return batch

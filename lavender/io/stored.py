@@ -21,10 +21,14 @@ from lavender.base.errors import InputError
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
 ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
-STATES_FOLDER = "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
+STATES_FOLDER = (
+    "states"  # Folder of the states before recorded steps, in the folder of recorded problems.
+)
 
 
-def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, continued: bool = False) -> Path:
+def prepare_step_folder(
+    path: str | os.PathLike[str], replace: bool = False, continued: bool = False
+) -> Path:
     """Create a folder for recorded problems if necessary, and return its path.
 
     The folder must not hold problem files, because the steps of two recordings are not one sequence. `replace` removes
@@ -43,7 +47,9 @@ def prepare_step_folder(path: str | os.PathLike[str], replace: bool = False, con
         for file in () if continued else (*old, folder / ENGINE):
             file.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"the files in {str(folder)!r} cannot be removed ({error.strerror})") from None
+        raise InputError(
+            f"the files in {str(folder)!r} cannot be removed ({error.strerror})"
+        ) from None
     return folder
 
 
@@ -51,7 +57,9 @@ def resolve_destination(path: str | os.PathLike[str]) -> Path:
     """Return the path at which a file is written: the target of symbolic links, a regular file or a new one."""
     target = os.path.realpath(as_path(path))
     if os.path.exists(target) and not os.path.isfile(target):
-        raise InputError(f"cannot write {path}: it is not a regular file; the name of a file is needed")
+        raise InputError(
+            f"cannot write {path}: it is not a regular file; the name of a file is needed"
+        )
     return Path(target)
 
 
@@ -126,7 +134,9 @@ def format_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(convert(value), indent=indent, allow_nan=False)
 
 
-def load_or_make_file(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
+def load_or_make_file(
+    path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]
+) -> bytes:
     """Return the content of a file if `is_current` accepts it; else return the result of `make` and try to store it."""
     if path.exists() and is_current(content := path.read_bytes()):
         return content
@@ -157,7 +167,8 @@ class Arrays(dict[str, np.ndarray]):
 
 def read_arrays(path: str | os.PathLike[str]) -> Arrays:
     """Read all arrays of an archive (.npz); nothing is unpickled."""
-    name, arrays = "", Arrays()
+    name = ""
+    arrays = Arrays()
     try:
         with as_path(path).open("rb") as stream:  # NumPy leaves a damaged file open.
             archive = np.load(stream, allow_pickle=False)
@@ -167,16 +178,22 @@ def read_arrays(path: str | os.PathLike[str]) -> Arrays:
                 arrays[name] = archive[name]
                 if not isinstance(arrays[name], np.ndarray):
                     raise ValueError("it is not an array")
-    except Exception as error:  # Damaged archives raise exceptions of zipfile, zlib, tokenize and others.
+    except (
+        Exception
+    ) as error:  # Damaged archives raise exceptions of zipfile, zlib, tokenize and others.
         entry = f"entry {name!r} of {path}" if name else f"{path}"
-        raise InputError(f"{entry} cannot be read: {error}; an .npz archive of arrays is needed") from None
+        raise InputError(
+            f"{entry} cannot be read: {error}; an .npz archive of arrays is needed"
+        ) from None
     return arrays
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:
     """Return a Path; raise InputError for numbers, which the operating system would treat as open files."""
     if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
-        raise InputError(f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed")
+        raise InputError(
+            f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed"
+        )
     if "\0" in os.fspath(path):
         raise InputError(f"path {path!r} has a NUL character, which no file name may have")
     return Path(path)
@@ -190,4 +207,6 @@ def read_bytes(path: str | os.PathLike[str], role: str = "", count: int = -1) ->
             return stream.read(count)
     except (OSError, ValueError) as error:
         named = f"{role} {str(path)!r}" if role else path
-        raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(
+            f"cannot read {named}: {getattr(error, 'strerror', None) or error}"
+        ) from None

@@ -64,7 +64,9 @@ def reconstruct(problem: Problem, velocity: ArrayLike) -> Reconstruction:
     check_problem(problem)
     form = problem.rows if problem.generalized is None else problem.generalized
     if form is None:
-        raise CapabilityError("this problem was given as a matrix; J and M are needed for velocities")
+        raise CapabilityError(
+            "this problem was given as a matrix; J and M are needed for velocities"
+        )
     shape = form.v_free.shape
     if problem.generalized is None and get_shape("velocity", velocity) == (shape[0], 3):
         planar = as_array("velocity", velocity, (shape[0], 3), unit="m/s, rad/s")
@@ -78,7 +80,9 @@ def reconstruct(problem: Problem, velocity: ArrayLike) -> Reconstruction:
         multiply_body_jacobian(problem.data, change, b)
     if not np.abs(b).max(initial=0.0) > np.finfo(float).tiny:
         b[:] = 0.0
-    rigid = replace(problem, b=b, friction="cone", compliance=np.zeros(problem.m), guess=None, qp=None)
+    rigid = replace(
+        problem, b=b, friction="cone", compliance=np.zeros(problem.m), guess=None, qp=None
+    )
     impulse = solve(rigid, impulse=rigid.start(), tol=RECONSTRUCTION_TOL).impulse
     left_over = np.abs(change - problem.compute_velocity_change(impulse)).max(initial=0.0)
     return Reconstruction(impulse, float(left_over))

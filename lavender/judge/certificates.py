@@ -46,8 +46,12 @@ from lavender.problem import Problem
 from lavender_ext.factor.linear import LinearSystem
 
 __all__ = [
-    "Proof", "check_certificate", "format_lower_bound", "list_conflicting_blocks", "prove_infeasibility",
-]  # fmt: skip
+    "Proof",
+    "check_certificate",
+    "format_lower_bound",
+    "list_conflicting_blocks",
+    "prove_infeasibility",
+]
 
 UNIT_ROUNDOFF = 2.0**-53
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
@@ -58,7 +62,9 @@ SAFE_SUM_RATIO = 1e3  # A sum below this multiple of its rounding bound is recom
 MAX_POLISHED_SLACK = 1e-6
 # Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
 MAX_EXACT_ROWS = 16
-MIN_NAMED_SHARE = 1e-6  # A message names only rows above this fraction of the largest |y| in the metric of D.
+MIN_NAMED_SHARE = (
+    1e-6  # A message names only rows above this fraction of the largest |y| in the metric of D.
+)
 MAX_NAMED_BLOCKS = 6  # Number of blocks of each kind that a message names.
 # Certificates with more rows are not polished: the dense least squares would be too large.
 MAX_POLISHED_ROWS = 1000
@@ -129,15 +135,23 @@ def prove_infeasibility(
     return proof
 
 
-def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
+def _prove_with_polished_directions(
+    problem: Problem, y: FloatArray, tol: float, deadline: Deadline
+) -> Proof:
     """Check y, and then polished directions if y fails only by rounding or if an exact proof may be found."""
-    with np.errstate(all="ignore"):  # Directions with numbers that overflow are not accepted as proofs.
+    with np.errstate(
+        all="ignore"
+    ):  # Directions with numbers that overflow are not accepted as proofs.
         inner = problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
-            reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
+            reason = (
+                f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
+            )
             return Proof(y, 0.0, reason)
         proof = _check_infeasibility_direction(inner, problem.on_disk(y), tol)
-        if 0.0 < proof.impulse_bound < math.inf and (proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS):
+        if 0.0 < proof.impulse_bound < math.inf and (
+            proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS
+        ):
             for polished in _polish_direction(inner, proof.y, deadline):
                 candidate = _check_infeasibility_direction(inner, polished, tol)
                 if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
@@ -147,8 +161,13 @@ def _prove_with_polished_directions(problem: Problem, y: FloatArray, tol: float,
             proof = replace(proof, y=problem.cones.stretch * proof.y)
         if proof.reason:
             return proof
-        sides = (_format_block_names(problem, blocks) for blocks in list_conflicting_blocks(problem, proof.y))
-        return replace(proof, conflict=" against ".join(filter(None, sides)))  # "joint 7 against contact 11"
+        sides = (
+            _format_block_names(problem, blocks)
+            for blocks in list_conflicting_blocks(problem, proof.y)
+        )
+        return replace(
+            proof, conflict=" against ".join(filter(None, sides))
+        )  # "joint 7 against contact 11"
 
 
 def list_conflicting_blocks(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -171,7 +190,9 @@ def _format_block_names(problem: Problem, blocks: tuple[int, ...]) -> str:
     matches = [re.fullmatch(r"(.*\S) (\d+)", name) for name in names[:MAX_NAMED_BLOCKS]]
     kinds = {match[1] for match in matches if match}
     if len(names) > 1 and all(matches) and len(kinds) == 1:  # Write "joints 7 and 9".
-        return f"{kinds.pop()}s " + _join_names([match[2] for match in matches if match], len(names))
+        return f"{kinds.pop()}s " + _join_names(
+            [match[2] for match in matches if match], len(names)
+        )
     return _join_names(names[:MAX_NAMED_BLOCKS], len(names))
 
 
@@ -190,9 +211,11 @@ def _check_infeasibility_direction(problem: Problem, y: FloatArray, tol: float) 
     if len(vanished):
         name = problem.row_name(int(vanished[0]))
         return Proof(y, 0.0, f"products of {name} vanish in float64: its row of A is not zero")
-    unscaled, y = y, y / _round_down_to_power_of_two(y)
+    unscaled = y
+    y = y / _round_down_to_power_of_two(y)
     # Compute b.y and the sum of the absolute values of its terms.
-    gain, gain_size = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
+    gain = float(problem.b @ y)
+    gain_size = float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
         return Proof(y, 0.0, f"b.y = {gain:.2e} is not positive")
     violation = _explain_recession_violation(problem, y)
@@ -202,11 +225,16 @@ def _check_infeasibility_direction(problem: Problem, y: FloatArray, tol: float) 
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Proof(y, 0.0, "A^T y overflows")
     rounding_factor = min((len(rows) + 2.0) * UNIT_ROUNDOFF, MAX_ROUNDING_SLACK * gain / gain_size)
-    support, slack, rounding = _compute_support_and_slack(problem, low, high, rounding_factor * size)
+    support, slack, rounding = _compute_support_and_slack(
+        problem, low, high, rounding_factor * size
+    )
     # (1)
-    net, sum_rounding = gain - float(support.sum()), (len(rows) + 4.0) * UNIT_ROUNDOFF
+    net = gain - float(support.sum())
+    sum_rounding = (len(rows) + 4.0) * UNIT_ROUNDOFF
     if not net > sum_rounding * (gain_size + float(np.abs(support).sum())):
-        return Proof(y, 0.0, f"A^T y reaches {high.max():.2e}; impulses within the bounds can meet b.y")
+        return Proof(
+            y, 0.0, f"A^T y reaches {high.max():.2e}; impulses within the bounds can meet b.y"
+        )
     # (2)
     max_slack = float(slack.max())
     bound = net / max_slack if max_slack > 0.0 else math.inf
@@ -257,7 +285,8 @@ def _multiply_transposed(a: Any, y: FloatArray) -> FloatArray:
 
     Such sums are formed from products of 26-bit halves, which are exact.
     """
-    out, size = a.T @ y, abs(a).T @ np.abs(y)
+    out = a.T @ y
+    size = abs(a).T @ np.abs(y)
     safe_sum = SAFE_SUM_RATIO * (len(y) + 2.0) * UNIT_ROUNDOFF * size
     cancels = np.flatnonzero((size > 0.0) & ~(np.abs(out) > safe_sum))
     if not len(cancels):
@@ -269,7 +298,9 @@ def _multiply_transposed(a: Any, y: FloatArray) -> FloatArray:
         high = VELTKAMP_FACTOR * x - (VELTKAMP_FACTOR * x - x)
         halves.append((high, x - high))
     terms = np.array([p * q for p, q in product(*halves)]).T.ravel().tolist()
-    out[cancels] = [math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())]
+    out[cancels] = [
+        math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())
+    ]
     return out
 
 
@@ -284,7 +315,8 @@ def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, Float
     The norm is taken over the rows of the component; x has shape (m,).
     """
     c = problem.cones
-    components, coefficient_of_row = list(c.friction_components()), c.friction_coefficient
+    components = list(c.friction_components())
+    coefficient_of_row = c.friction_coefficient
     normal = c.ptr[np.array([block for block, _ in components], int)]
     coefficient = np.array([coefficient_of_row[rows[0]] for _, rows in components])
     return normal, coefficient, np.array([np.hypot.reduce(x[rows]) for _, rows in components])
@@ -299,7 +331,8 @@ def _compute_support_and_slack(
     and on bounded rows with |z_i| within rounding; their support counts as 0. A contact has one value for all of its
     rows, at its normal row.
     """
-    c, size = problem.cones, np.maximum(-low, high)
+    c = problem.cones
+    size = np.maximum(-low, high)
     corners = [
         np.multiply(z, bound, out=np.zeros(problem.m), where=z != 0.0)
         for z in (low, high)
@@ -319,12 +352,16 @@ def _compute_support_and_slack(
     return np.where(is_slack, 0.0, support), np.where(is_slack, size, 0.0), rounding
 
 
-def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> tuple[float, float]:
+def _compute_min_residual(
+    problem: Problem, net: float, y: FloatArray, z: FloatArray
+) -> tuple[float, float]:
     """Return the minimum relative residual (5) of any impulse, and the residual that rounding of b can cause.
 
     If b was computed, its rounding is the rounding of target and J v*.
     """
-    data, size, rows = problem.metric, np.abs(problem.b), np.flatnonzero(y)
+    data = problem.metric
+    size = np.abs(problem.b)
+    rows = np.flatnonzero(y)
     get_zero_impulse_reference(problem)
     energy = net / (_compute_energy_norm(data, y * data.d) + _compute_energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
@@ -355,17 +392,22 @@ def _polish_direction(problem: Problem, y: FloatArray, deadline: Deadline) -> It
     length = np.sqrt(problem.d)
     is_used = np.abs(y) * length > MAX_ROUNDING_SLACK * float(length @ np.abs(y))
     if problem.matrix is not None:
-        a, weight = problem.csr, 1.0 / length
+        a = problem.csr
+        weight = 1.0 / length
     elif problem.rows is None:
-        a, weight = problem.jacobian, 1.0 / np.sqrt(problem.generalized.mass.diagonal())  # type: ignore[union-attr]
+        a = problem.jacobian
+        weight = 1.0 / np.sqrt(problem.generalized.mass.diagonal())  # type: ignore[union-attr]
     else:
-        a, weight = problem.jacobian, np.sqrt(problem.rows.inverse_mass_matrix().diagonal())
+        a = problem.jacobian
+        weight = np.sqrt(problem.rows.inverse_mass_matrix().diagonal())
     if problem.compliance is not None:
         is_used &= problem.compliance == 0.0
-    rows, y = np.flatnonzero(is_used), np.where(is_used, y, 0.0)
+    rows = np.flatnonzero(is_used)
+    y = np.where(is_used, y, 0.0)
     if not 0 < len(rows) <= MAX_POLISHED_ROWS:
         return
-    a, required = a[rows], rows if problem.matrix is not None else slice(None)
+    a = a[rows]
+    required = rows if problem.matrix is not None else slice(None)
     for _ in range(2):
         z = weight * _multiply_transposed(a, y[rows])
         max_z = MAX_POLISHED_SLACK * float(length @ np.abs(y))
@@ -391,7 +433,9 @@ def solve_least_squares(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     wide = matrix.shape[0] < matrix.shape[1]
     product = np.zeros(2 * (min(matrix.shape),))
     short = matrix if wide else matrix.T
-    for first in range(0, short.shape[1], PRODUCT_COLUMNS):  # Larger products would start threads of BLAS.
+    for first in range(
+        0, short.shape[1], PRODUCT_COLUMNS
+    ):  # Larger products would start threads of BLAS.
         part = np.ascontiguousarray(short[:, first : first + PRODUCT_COLUMNS])
         product += part @ part.T
     size = float(np.trace(product))
@@ -421,7 +465,9 @@ def _explain_recession_violation(problem: Problem, y: FloatArray) -> str | None:
             name = problem.row_name(int(tangential[0]))
             return f"y is not along the normal of {name}, as Coulomb friction needs"
     first = c.normal_rows
-    outside = np.concatenate([first[y[first] < 0.0], normal[size > coefficient * y[normal] * (1 + 1e-12)]])
+    outside = np.concatenate(
+        [first[y[first] < 0.0], normal[size > coefficient * y[normal] * (1 + 1e-12)]]
+    )
     if len(outside):
         return f"y leaves the cone of {problem.row_name(int(outside.min()))}"
     return None

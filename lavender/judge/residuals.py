@@ -70,7 +70,9 @@ from lavender_ext.judge import measure
 
 # [-] A relative residual above this is never attributed to rounding to float64.
 MAX_EXCUSED_RESIDUAL = 1e-5
-MAX_REST_VELOCITY = 1e-9  # [m/s] If V0 is smaller, the zero impulse counts as the problem's solution.
+MAX_REST_VELOCITY = (
+    1e-9  # [m/s] If V0 is smaller, the zero impulse counts as the problem's solution.
+)
 UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to the next number.
 
 # at_floor(relative, floor) returns whether rounding explains the residual of one island. Solvers call this kernel, too.
@@ -80,8 +82,11 @@ TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
 # [m/s] Default of `threshold`: sensors of robots do not measure smaller velocity errors.
 DEFAULT_THRESHOLD = 1e-6
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
-    "at its floor", "close enough", "stopped before convergence", "wrong",
-)  # fmt: skip
+    "at its floor",
+    "close enough",
+    "stopped before convergence",
+    "wrong",
+)
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,9 @@ class Rounding:
 
     impulse: float  # Rounding of the impulse, (1) of the module.
     data: float  # Rounding of the problem's data, or of A and b formed from it, (2, 3, 4).
-    velocities: float  # Impulses computed from rounded velocities, (5); 0 if an active row is rigid.
+    velocities: (
+        float  # Impulses computed from rounded velocities, (5); 0 if an active row is rigid.
+    )
 
     def __str__(self) -> str:
         more = f", velocities {self.velocities:.1e}" if self.velocities else ""
@@ -204,15 +211,24 @@ class Residual:
         mistake, such as a wrong mu, cannot be distinguished from a stop before convergence.
         """
         return compute_verdict(
-            self.relative, self.roundoff_floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
-            self.nothing_to_do, self.precision, self.threshold,
-        )  # fmt: skip
+            self.relative,
+            self.roundoff_floor,
+            self.above_floor,
+            self.energy,
+            self.velocity,
+            self.energy_rhs,
+            self.nothing_to_do,
+            self.precision,
+            self.threshold,
+        )
 
     @property
     def verdict_in_words(self) -> str:
         """The verdict, with the factor over the floor if the solve stopped before convergence."""
         verdict = self.verdict
-        return f"{verdict}, {self.excess:.2g} times its floor" if verdict == UNCONVERGED else verdict
+        return (
+            f"{verdict}, {self.excess:.2g} times its floor" if verdict == UNCONVERGED else verdict
+        )
 
     @property
     def excess(self) -> float:
@@ -349,7 +365,9 @@ def get_zero_impulse_reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.reference_energy < 0.0:
-        rows, general, free = problem.rows, problem.generalized, None
+        rows = problem.rows
+        general = problem.generalized
+        free = None
         if rows is not None:
             free = rows.v_free.ravel()
         elif general is not None:
@@ -388,7 +406,11 @@ def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
 
 
 def combine_best_islands(
-    problem: Problem, start: FloatArray, impulses: Sequence[FloatArray], tol: float, by_energy: bool = False
+    problem: Problem,
+    start: FloatArray,
+    impulses: Sequence[FloatArray],
+    tol: float,
+    by_energy: bool = False,
 ) -> FloatArray:
     """Return the best of a start and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 
@@ -415,7 +437,9 @@ def reuse_or_judge_impulse(
 def find_relative_at_zero(problem: Problem, impulse: FloatArray) -> float | None:
     """Return the known relative residual if `impulse` is the zero impulse, bit for bit; else None."""
     relative: float = problem.metric.relative_at_zero
-    return relative if relative >= 0.0 and measure.are_bit_identical(problem._start, impulse) else None
+    return (
+        relative if relative >= 0.0 and measure.are_bit_identical(problem._start, impulse) else None
+    )
 
 
 def residual(
@@ -463,27 +487,39 @@ def residual(
     """
     result = measure_residual(problem, impulse, precision, threshold, tol)
     motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
-    if motion is not None and not result.at_floor and np.array_equal(motion.impulse, result._impulse):
+    if (
+        motion is not None
+        and not result.at_floor
+        and np.array_equal(motion.impulse, result._impulse)
+    ):
         result = motion.judge(problem, result)
     return result
 
 
 def measure_residual(
-    problem: Problem, impulse: Any, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD,
+    problem: Problem,
+    impulse: Any,
+    precision: str | None = None,
+    threshold: float = DEFAULT_THRESHOLD,
     tol: float = TOL,
-) -> Residual:  # fmt: skip
+) -> Residual:
     """Return the residual of the impulses themselves, even if an engine moved the bodies by another acceleration."""
     check_problem(problem)
-    precision = problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
+    precision = (
+        problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
+    )
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
         impulse = problem.make_start(impulse, finite=False)
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        of_disk = measure_residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
+        of_disk = measure_residual(
+            problem.disk, problem.on_disk(impulse), precision, threshold, tol
+        )
         stretch = problem.cones.stretch
         with np.errstate(over="ignore"):
-            error, slack = mark_read_only(stretch * of_disk.error), mark_read_only(of_disk.slack / stretch)
+            error = mark_read_only(stretch * of_disk.error)
+            slack = mark_read_only(of_disk.slack / stretch)
         return replace(of_disk, error=error, slack=slack, _problem=problem)
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
         tol = check_float("tol", tol, low=0.0)
@@ -513,9 +549,18 @@ def replace_error(
         for x, floor in zip(by_island, floors, strict=True)
     ]
     return replace(
-        result, relative=by_island[at], energy=energy, velocity=velocity, roundoff_floor=floors[at], worst_row=worst,
-        error=mark_read_only(error), worst_island=-1, above_floor=max(above), moved_by="acceleration", **fields,
-    )  # fmt: skip
+        result,
+        relative=by_island[at],
+        energy=energy,
+        velocity=velocity,
+        roundoff_floor=floors[at],
+        worst_row=worst,
+        error=mark_read_only(error),
+        worst_island=-1,
+        above_floor=max(above),
+        moved_by="acceleration",
+        **fields,
+    )
 
 
 def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:
@@ -523,7 +568,9 @@ def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray
     # For an impulse that is not finite, the floor is not finite.
     with np.errstate(over="ignore", invalid="ignore"):
         of_impulse, of_data, of_velocities = estimate_float32_slack_errors(problem, impulse)
-        relative = [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
+        relative = (
+            [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
+        )
         squares = of_impulse, of_data, of_velocities, of_impulse + of_data + of_velocities
     floors = [measure.relative_size_by_island(problem.metric, x) for x in squares]
     *contributions, floor = (x[max(result.worst_island, 0)] for x in floors)
@@ -531,9 +578,13 @@ def _apply_float32_floor(problem: Problem, result: Residual, impulse: FloatArray
         _is_explained_by_rounding(x, island_floor, "float32") and x < 1.0
         for x, island_floor in zip(relative, floors[-1], strict=True)
     ]
-    above = max((x for x, rounds in zip(relative, is_rounding, strict=True) if not rounds), default=0.0)
+    above = max(
+        (x for x, rounds in zip(relative, is_rounding, strict=True) if not rounds), default=0.0
+    )
     rounding = Rounding(*contributions)
-    return replace(result, precision="float32", roundoff_floor=floor, above_floor=above, rounding=rounding)
+    return replace(
+        result, precision="float32", roundoff_floor=floor, above_floor=above, rounding=rounding
+    )
 
 
 def estimate_float32_slack_errors(
@@ -547,8 +598,11 @@ def estimate_float32_slack_errors(
             problem.metric, general.operator.mass, free, impulse
         )
         return of_impulse, of_data, of_velocities
-    unit, zeros = UNIT_ROUNDOFF_FLOAT32 * UNIT_ROUNDOFF_FLOAT32, np.zeros(problem.m)
-    a, b, lam = _square_entries(problem.csr), problem.b**2, impulse**2
+    unit = UNIT_ROUNDOFF_FLOAT32 * UNIT_ROUNDOFF_FLOAT32
+    zeros = np.zeros(problem.m)
+    a = _square_entries(problem.csr)
+    b = problem.b**2
+    lam = impulse**2
     of_impulse = a @ lam
     if problem.matrix is not None:
         of_data = zeros if problem.precision == "float32" else unit * (of_impulse + b)
@@ -557,7 +611,8 @@ def estimate_float32_slack_errors(
     assert compliance is not None
     assert rows is not None
     inverse = rows.inverse_mass_matrix()
-    x, free = inverse @ (jac.T @ impulse), rows.v_free.ravel()
+    x = inverse @ (jac.T @ impulse)
+    free = rows.v_free.ravel()
     of_inverse = _square_entries(jac @ inverse) @ (_square_entries(jac.T) @ lam)
     of_inverse += _square_entries(jac) @ (_square_entries(inverse) @ (jac.T @ impulse) ** 2)
     of_rhs = (problem.b + jac @ free) ** 2 + 2.0 * (_square_entries(jac) @ free**2)

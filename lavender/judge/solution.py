@@ -36,7 +36,10 @@ class Status(str, Enum):
         return member
 
     CONVERGED = "CONVERGED", "the solver's own test at tol was met"
-    ROUNDOFF_LIMIT = "ROUNDOFF_LIMIT", "the residual or its floor is above tol, within twice the floor"
+    ROUNDOFF_LIMIT = (
+        "ROUNDOFF_LIMIT",
+        "the residual or its floor is above tol, within twice the floor",
+    )
     MAX_ITERATIONS = "MAX_ITERATIONS", "the iteration budget was used up"
     TIME_LIMIT = "TIME_LIMIT", "the time limit was reached"
     STALLED = "STALLED", "no further progress"
@@ -45,7 +48,10 @@ class Status(str, Enum):
         "INFEASIBLE",
         "no solution exists; `certificate` proves it, unless `claim_check` says otherwise",
     )
-    UNBOUNDED = "UNBOUNDED", "the objective of a quadratic program decreases without limit along `ray`"
+    UNBOUNDED = (
+        "UNBOUNDED",
+        "the objective of a quadratic program decreases without limit along `ray`",
+    )
     NUMERICAL_ERROR = "NUMERICAL_ERROR", "a factorisation or the backend failed"
     INTERRUPTED = "INTERRUPTED", "stopped by Ctrl-C or by the callback"
     INVALID_PROBLEM = "INVALID_PROBLEM", "the data of one world of a batch are not a valid problem"
@@ -168,7 +174,9 @@ class History:
         if not len(self.iterations):
             return "<History without records>"
         ends = f"relative {self.relative[0]:.2e} to {self.relative[-1]:.2e}"
-        return f"<History of {len(self.iterations)} records, {self.iterations[-1]} iterations, {ends}>"
+        return (
+            f"<History of {len(self.iterations)} records, {self.iterations[-1]} iterations, {ends}>"
+        )
 
     def _draw(self, axes: Any, against: str = "iterations") -> None:
         """Draw the relative residual into axes of matplotlib."""
@@ -344,7 +352,9 @@ class Solution:
         if self.velocity_tol is not None:
             return self.residual.velocity <= self.velocity_tol
         judged = self.residual
-        return judged.relative <= self.tol and (judged.roundoff_floor <= self.tol or self.tol == 0.0)
+        return judged.relative <= self.tol and (
+            judged.roundoff_floor <= self.tol or self.tol == 0.0
+        )
 
     @property
     def is_contradicted(self) -> bool:
@@ -421,8 +431,14 @@ class Solution:
 
     def __str__(self) -> str:
         note = f"; {self.message}" if self.message else ""
-        wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
-        judged = self.residual if self.program_error is None else f"program error {self.program_error:.1e}"
+        wrong = (
+            f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
+        )
+        judged = (
+            self.residual
+            if self.program_error is None
+            else f"program error {self.program_error:.1e}"
+        )
         return f"{self.solver.name}: {self.status.name}, {judged}, {self._work_text}, {self._time_text}{note}{wrong}"
 
 

@@ -67,7 +67,8 @@ class States(Sequence[State]):
             # A contact slides if any component slides; a joint is at a bound if any of its rows is.
             self._code = np.maximum.reduceat(self.case, first)
         else:
-            self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
+            self.margin = np.zeros(0)
+            self._code = np.zeros(0, np.int8)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,14 +83,18 @@ class States(Sequence[State]):
             return [self[j] for j in range(*i.indices(len(self)))]
         i = check_int("block", i + len(self) if isinstance(i, int) and i < 0 else i)
         if i >= len(self):
-            raise IndexError(f"block {i} does not exist; there are {len(self)} blocks, numbered from 0")
+            raise IndexError(
+                f"block {i} does not exist; there are {len(self)} blocks, numbered from 0"
+            )
         ptr = self._problem.cones.ptr
         rows = tuple(NAMES[case] for case in self.case[ptr[i] : ptr[i + 1]])
         return State(NAMES[self._code[i]], rows, float(self.margin[i]))
 
     def __repr__(self) -> str:
         names = self.names
-        return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
+        return (
+            ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
+        )
 
 
 def judge_and_linearise_impulse(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
@@ -102,4 +107,6 @@ def judge_and_linearise_impulse(problem: Problem, impulse: FloatArray, max_rows:
 
 def compute_states(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
     """Return the states at an impulse (m,) [N s]; `linear`: the linearisation at that impulse, if known."""
-    return States(problem, judge_and_linearise_impulse(problem, impulse) if linear is None else linear)
+    return States(
+        problem, judge_and_linearise_impulse(problem, impulse) if linear is None else linear
+    )

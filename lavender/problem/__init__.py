@@ -15,6 +15,13 @@ from lavender.problem.problem import Problem, VelocityForm
 from lavender.problem.program import QPSolution
 
 __all__ = [
-    "FRICTION_LAWS", "LAWS", "OPERATORS", "PRECISIONS", "Names", "Problem", "QPSolution", "VelocityForm",
+    "FRICTION_LAWS",
+    "LAWS",
+    "OPERATORS",
+    "PRECISIONS",
+    "Names",
+    "Problem",
+    "QPSolution",
+    "VelocityForm",
     "check_problem",
-]  # fmt: skip
+]

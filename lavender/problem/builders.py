@@ -59,7 +59,9 @@ def check_rhs_length(A: Any, b: FloatArray) -> None:
     """Raise an InputError about b if A is square and its number of rows differs from the length of b."""
     shape = A.shape if isinstance(A, np.ndarray) or issparse(A) else get_shape("A", A)
     if len(shape) == 2 and shape[0] == shape[1] != len(b):
-        raise InputError(f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows")
+        raise InputError(
+            f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows"
+        )
 
 
 def check_options(method: str, options: Mapping[str, Any]) -> None:
@@ -75,7 +77,9 @@ class Builders(Operators):
     """Class methods that build a problem."""
 
     @classmethod
-    def linear(cls: type[ProblemT], A: Any, b: ArrayLike, **more: Unpack[ProblemOptions]) -> ProblemT:
+    def linear(
+        cls: type[ProblemT], A: Any, b: ArrayLike, **more: Unpack[ProblemOptions]
+    ) -> ProblemT:
         """Build the linear system A lambda = b, in which every row is unbounded.
 
         Parameters
@@ -307,14 +311,20 @@ class Builders(Operators):
         if tangents is None:
             tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
-        contacts = make_contacts(mu, tangents, patch_radius, rolling, check_name("shape", shape, SHAPES))
-        named, zeros = (("lower", lower), ("upper", upper)), np.zeros(rows.n_joints)
-        low, high = (as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named)
+        contacts = make_contacts(
+            mu, tangents, patch_radius, rolling, check_name("shape", shape, SHAPES)
+        )
+        named = (("lower", lower), ("upper", upper))
+        zeros = np.zeros(rows.n_joints)
+        low, high = (
+            as_array(name, x, (len(rows.jac),), finite=False, unit="N s") for name, x in named
+        )
         joints = Cones(rows.joint_ptr, zeros, low, high, mu=zeros, patch_radius=zeros)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
-        problem, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
+        problem = cls(np.zeros(m), cones, rows=rows, **more)
+        jv = np.zeros(m + 1)
         multiply_body_jacobian(problem.data, rows.v_free, jv)
         problem.b.setflags(write=True)  # No other code has access to the problem yet.
         problem.b[:] = target - jv[:m]
@@ -392,18 +402,24 @@ class Builders(Operators):
                 "are those of contacts, else cones=, such as lavender.Cones.free(6) + lavender.Cones.contacts(0.5)"
             )
         if mu is None and tangents is not None:
-            raise InputError("tangents has no effect without mu: leave it out, or give mu in place of cones")
+            raise InputError(
+                "tangents has no effect without mu: leave it out, or give mu in place of cones"
+            )
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
         if cones is None:
             cones = make_contacts_of_rows("J", m, mu, tangents)
         elif isinstance(cones, Cones) and cones.n_rows != m:
             hint = (
-                " (a contact has a normal and two tangents, or tangents=0, 1)" if np.any(cones.kind) else ""
+                " (a contact has a normal and two tangents, or tangents=0, 1)"
+                if np.any(cones.kind)
+                else ""
             )
             raise InputError(f"J has {m} rows; {cones.n_rows} are needed, as the cones have{hint}")
         if "precision" not in more:
-            more["precision"] = get_common_precision(J, *(M if isinstance(M, (list, tuple)) else [M]), v_free)
+            more["precision"] = get_common_precision(
+                J, *(M if isinstance(M, (list, tuple)) else [M]), v_free
+            )
         return cls(
             generalized.bias(target),  # `Problem` rejects entries that are not finite.
             cones,
@@ -505,7 +521,9 @@ class Builders(Operators):
                 f"J, M, v_free and target need generalised coordinates; the problem is given by {self.operator}"
             )
         if b is not None and target is not None:
-            raise InputError("b and target are both given; one of them determines the right-hand side")
+            raise InputError(
+                "b and target are both given; one of them determines the right-hand side"
+            )
         if b is None and target is None and (J is not None or v_free is not None):
             raise InputError(
                 "J or v_free is given without target and b; one of them is needed, since b = target - J v_free"
@@ -514,7 +532,10 @@ class Builders(Operators):
             if M is None:
                 general = general.with_jacobian(J, v_free)
             else:
-                jac, free = general.jac if J is None else J, general.v_free if v_free is None else v_free
+                jac, free = (
+                    general.jac if J is None else J,
+                    general.v_free if v_free is None else v_free,
+                )
                 general = Generalized(jac, M, free, general.names)
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")

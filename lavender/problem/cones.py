@@ -51,23 +51,43 @@ from lavender_ext.core import blocks as kernels
 from lavender_ext.core.checks import FAULT_NAMES, are_pointers_valid, make_instance
 
 __all__ = [
-    "CONTACT", "CONTACT_BOX", "CONTACT_ELLIPSE", "CONTACT_ROLLING", "CONTACT_SPIN", "ROUND", "ROW", "SHAPES", "Cones",
-    "get_block_kinds", "project_impulse",
-]  # fmt: skip
+    "CONTACT",
+    "CONTACT_BOX",
+    "CONTACT_ELLIPSE",
+    "CONTACT_ROLLING",
+    "CONTACT_SPIN",
+    "ROUND",
+    "ROW",
+    "SHAPES",
+    "Cones",
+    "get_block_kinds",
+    "project_impulse",
+]
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
 CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
 # For each kind of contact: its name, and its permitted rows, for messages.
 CONTACT_ROWS = {
-    CONTACT: ("a contact", "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN"),
-    CONTACT_SPIN: ("a contact with spin", "a normal, up to two tangents and one spin row are allowed"),
-    ROUND: ("a round cone", "a normal and three to five tangents (2 sliding, 1 spin, 2 rolling) are allowed"),
+    CONTACT: (
+        "a contact",
+        "a normal and up to two tangents are allowed; a spin row needs CONTACT_SPIN",
+    ),
+    CONTACT_SPIN: (
+        "a contact with spin",
+        "a normal, up to two tangents and one spin row are allowed",
+    ),
+    ROUND: (
+        "a round cone",
+        "a normal and three to five tangents (2 sliding, 1 spin, 2 rolling) are allowed",
+    ),
     CONTACT_BOX: ("a box", "a normal and two tangents are needed"),
-    CONTACT_ROLLING: ("a contact with rolling",
-                      "a normal, two tangents, optionally a spin row, and two rolling rows are needed: 5 or 6"),
+    CONTACT_ROLLING: (
+        "a contact with rolling",
+        "a normal, two tangents, optionally a spin row, and two rolling rows are needed: 5 or 6",
+    ),
     CONTACT_ELLIPSE: ("an ellipse", "a normal and two tangents are needed"),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -118,12 +138,20 @@ class Cones:
     mu: FloatArray
     patch_radius: FloatArray
     rolling: FloatArray
-    _blocks: ClassVar[kernels.Blocks]  # Set on each instance: the arrays of the fields as kernels read them.
+    _blocks: ClassVar[
+        kernels.Blocks
+    ]  # Set on each instance: the arrays of the fields as kernels read them.
 
     def __init__(
-        self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
-        patch_radius: ArrayLike, rolling: ArrayLike | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        ptr: ArrayLike,
+        kind: ArrayLike,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        mu: ArrayLike,
+        patch_radius: ArrayLike,
+        rolling: ArrayLike | None = None,
+    ) -> None:
         rolling = np.zeros(np.size(kind)) if rolling is None else rolling
         fields: tuple[Any, ...] = (ptr, kind, lower, upper, mu, patch_radius, rolling)
         blocks = kernels.make_blocks_from_copied_arrays(*fields)
@@ -134,12 +162,16 @@ class Cones:
                 _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), fields)
         self.__dict__["_blocks"] = blocks
 
-    if not TYPE_CHECKING:  # Hide `__getattr__` from type checkers, so that they report unknown names.
+    if (
+        not TYPE_CHECKING
+    ):  # Hide `__getattr__` from type checkers, so that they report unknown names.
 
         def __getattr__(self, name: str) -> Any:
             # The arrays of the fields are created when one of them is first read.
             if name not in CONES_FIELDS:
-                raise AttributeError(f"'Cones' object has no attribute {name!r}", name=name, obj=self)
+                raise AttributeError(
+                    f"'Cones' object has no attribute {name!r}", name=name, obj=self
+                )
             self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
             return self.__dict__[name]
 
@@ -155,7 +187,9 @@ class Cones:
         """Concatenate the blocks of several cones."""
         blocks = kernels.concatenate_blocks([each._blocks for each in cones])
         if blocks is None:
-            raise InputError("the blocks together have more than 2^31 - 1 rows; 32-bit indices are needed")
+            raise InputError(
+                "the blocks together have more than 2^31 - 1 rows; 32-bit indices are needed"
+            )
         return cls._from_blocks(blocks)
 
     def __repr__(self) -> str:
@@ -238,7 +272,9 @@ class Cones:
         >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
         True
         """
-        return cls._from_blocks(make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape))
+        return cls._from_blocks(
+            make_contact_blocks(mu, tangents, patch_radius, rolling, count, shape)
+        )
 
     @property
     def n_blocks(self) -> int:
@@ -298,7 +334,8 @@ class Cones:
     @property
     def stretch(self) -> FloatArray:
         """Factor of each row (m,) that converts ellipses to disks: mu_i / max(mu_1, mu_2) on tangents, else 1."""
-        factor, ellipses = np.ones(self.n_rows), np.flatnonzero(self.kind == CONTACT_ELLIPSE)
+        factor = np.ones(self.n_rows)
+        ellipses = np.flatnonzero(self.kind == CONTACT_ELLIPSE)
         q = self.patch_radius[ellipses]
         factor[self.ptr[ellipses] + 1] = np.where(q > 1.0, 1.0 / q, 1.0)
         factor[self.ptr[ellipses] + 2] = np.where(q > 1.0, 1.0, q)
@@ -308,7 +345,8 @@ class Cones:
     def ellipses_replaced_by_disks(self) -> Cones:
         """These blocks, with each ellipse replaced by a disk of its larger coefficient."""
         ellipse = self.is_ellipse
-        kind, radius = np.where(ellipse, CONTACT, self.kind), np.where(ellipse, 0.0, self.patch_radius)
+        kind = np.where(ellipse, CONTACT, self.kind)
+        radius = np.where(ellipse, 0.0, self.patch_radius)
         mu = np.where(ellipse, self.coefficients.max(axis=1), self.mu)
         return replace(self, kind=kind, mu=mu, patch_radius=radius)
 
@@ -326,7 +364,9 @@ class Cones:
     def coefficients(self) -> FloatArray:
         """Coefficients (k, 2) of the first and second tangent; they differ for boxes and ellipses; 0 for ROW."""
         mu = np.where(self.kind == ROW, 0.0, self.mu)
-        second = mu * np.where(np.isin(self.kind, (CONTACT_BOX, CONTACT_ELLIPSE)), self.patch_radius, 1.0)
+        second = mu * np.where(
+            np.isin(self.kind, (CONTACT_BOX, CONTACT_ELLIPSE)), self.patch_radius, 1.0
+        )
         return np.stack([np.where(mu <= MIN_COEFFICIENT_RATIO * second, 0.0, mu), second], axis=1)
 
     @cached_property
@@ -352,16 +392,25 @@ class Cones:
             `shape` is "box", and a contact has two tangents and spin, or is a round cone; or `shape` is "disk", and a
             box has no friction along one tangent.
         """
-        kind, radius, has_pair = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
+        kind = self.kind.copy()
+        radius = self.patch_radius.copy()
+        has_pair = self.n_tangents > 1
         if check_name("shape", shape, SHAPES) == "box":
-            bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
+            bad = np.flatnonzero(
+                has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE))
+            )
             if len(bad):
-                raise InputError(f"block {bad[0]} has spin, rolling or over two tangents, which no box has")
-            kind[has_pair], radius[has_pair & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
+                raise InputError(
+                    f"block {bad[0]} has spin, rolling or over two tangents, which no box has"
+                )
+            kind[has_pair] = CONTACT_BOX
+            radius[has_pair & (self.kind == CONTACT)] = 1.0
         else:
             box = np.flatnonzero(self.kind == CONTACT_BOX)
             ratio = convert_ellipse_coefficients(self.coefficients[box])[1]
-            kind[box] = CONTACT if ratio is None else np.where(ratio == 1.0, CONTACT, CONTACT_ELLIPSE)
+            kind[box] = (
+                CONTACT if ratio is None else np.where(ratio == 1.0, CONTACT, CONTACT_ELLIPSE)
+            )
             radius[box] = 0.0 if ratio is None else np.where(ratio == 1.0, 0.0, ratio)
         return replace(self, kind=kind, patch_radius=radius)
 
@@ -407,8 +456,12 @@ class Cones:
     @cached_property
     def spin_rows(self) -> IntArray:
         """Spin row of each block (k,), -1 if it has none."""
-        has_spin = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
-        return mark_read_only(np.where(has_spin, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
+        has_spin = (self.kind == CONTACT_SPIN) | (
+            (self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6)
+        )
+        return mark_read_only(
+            np.where(has_spin, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32)
+        )
 
     @cached_property
     def separate_rows(self) -> IntArray:
@@ -419,7 +472,9 @@ class Cones:
     @cached_property
     def rolling_rows(self) -> IntArray:
         """First of the two separately bounded rolling rows of each block (k,), -1 if it has none."""
-        return mark_read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
+        return mark_read_only(
+            np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
+        )
 
     def friction_components(self) -> Iterator[tuple[int, IntArray]]:
         """Yield (block, rows) of each friction component: rows with one bound of their norm.
@@ -459,7 +514,9 @@ class Cones:
         size = np.diff(self.ptr)[blocks]
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
         rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)
-        kind, mu, radius, rolling = (x[blocks] for x in (self.kind, self.mu, self.patch_radius, self.rolling))
+        kind, mu, radius, rolling = (
+            x[blocks] for x in (self.kind, self.mu, self.patch_radius, self.rolling)
+        )
         return Cones(ptr, kind, self.lower[rows], self.upper[rows], mu, radius, rolling)
 
     def __add__(self, other: object) -> Cones:
@@ -491,7 +548,8 @@ def _convert_fields(
     ptr = as_array("cones.ptr", ptr, (None,), dtype=np.int32)
     if not are_pointers_valid(ptr, 1):
         raise InputError(f"cones.ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase")
-    k, m = len(ptr) - 1, int(ptr[-1])
+    k = len(ptr) - 1
+    m = int(ptr[-1])
     kind = as_array("cones.kind", kind, (k,), dtype=np.int32)
     if k and not np.isin(kind, kernels.KINDS).all():
         raise InputError(
@@ -526,7 +584,9 @@ def get_block_kinds(
     box, spin, rolling : bool or (k,) bool
         Whether each of two tangents has its own bound; whether the contact has a spin row; two rolling rows.
     """
-    kind = np.where(np.asarray(spin), CONTACT_SPIN, np.where(np.asarray(tangents) > 2, ROUND, CONTACT))
+    kind = np.where(
+        np.asarray(spin), CONTACT_SPIN, np.where(np.asarray(tangents) > 2, ROUND, CONTACT)
+    )
     kind = np.where(box, CONTACT_BOX, np.where(rolling, CONTACT_ROLLING, kind))
     return np.where(is_contact, kind, ROW).astype(np.int32)
 
@@ -536,21 +596,27 @@ def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoRe
     ptr, kind, lower, upper, mu, radius, rolling = fields
     if fault == "kind":
         name, requirement = CONTACT_ROWS[int(kind[index])]
-        raise InputError(f"block {index} is {name} of {ptr[index + 1] - ptr[index]} rows; {requirement}")
+        raise InputError(
+            f"block {index} is {name} of {ptr[index + 1] - ptr[index]} rows; {requirement}"
+        )
     if fault == "bounds":
         raise InputError(
             f"row {index}: lower = {lower[index]}, upper = {upper[index]}; a finite number between is needed"
         )
     if fault == "ratio":
-        raise InputError(f"block {index} has mu_2 / mu_1 = {radius[index]:g}; 1e-18 to 1e18 is needed")
+        raise InputError(
+            f"block {index} has mu_2 / mu_1 = {radius[index]:g}; 1e-18 to 1e18 is needed"
+        )
     if fault in ("lower", "upper"):
         bound = lower if fault == "lower" else upper
         is_unread = np.isinf(bound) | np.repeat(kind != ROW, np.diff(ptr))
         check_finite_and_in_range(fault, np.where(is_unread, 0.0, bound), "N s")
     product = np.where(kind == ROW, 0.0, mu * radius)
     for name, x, unit in (
-        ("mu", mu, "-"), ("patch_radius", radius, "m"), ("mu patch_radius (of boxes and ellipses mu_2)", product, "m"),
+        ("mu", mu, "-"),
+        ("patch_radius", radius, "m"),
+        ("mu patch_radius (of boxes and ellipses mu_2)", product, "m"),
         ("rolling", rolling, "m"),
-    ):  # fmt: skip
+    ):
         check_nonnegative_magnitudes(name, x, unit)
     raise InputError(f"block {index} is invalid: {fault}")

@@ -6,7 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, as_array, check_int, check_unmasked, get_shape
+from lavender.base.arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    check_int,
+    check_unmasked,
+    get_shape,
+)
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, get_block_kinds
 
@@ -15,7 +22,13 @@ def make_contacts_of_rows(
     name: str, m: int, mu: Any, tangents: Any, patch_radius: Any = None, rolling: Any = None
 ) -> Cones:
     """Build contacts with equal numbers of rows from m rows and a mu for each contact; `name` has the rows."""
-    if type(mu) is float and tangents is None and patch_radius is None and rolling is None and m % 3 == 0:
+    if (
+        type(mu) is float
+        and tangents is None
+        and patch_radius is None
+        and rolling is None
+        and m % 3 == 0
+    ):
         return Cones.contacts(mu, count=m // 3)
     check_unmasked("mu", mu)
     angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
@@ -50,7 +63,9 @@ def make_contacts_of_rows(
     return Cones.contacts(mu, count, patch_radius, rolling=rolling)
 
 
-def make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
+def make_contacts(
+    mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str
+) -> Cones:
     """Build contacts of 0 to 2 tangents (c,), with spin rows if a patch radius is given, rolling rows if mu_r is."""
     has_spin, has_rolling = patch_radius is not None, rolling is not None
     for is_bad, requirement in (
@@ -63,13 +78,16 @@ def make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling
     ):
         if is_bad.any():
             i = int(is_bad.argmax())
-            raise InputError(f"tangents of contact {i} is {tangents[i]}, and mu {mu[i]:g}; {requirement}")
+            raise InputError(
+                f"tangents of contact {i} is {tangents[i]}, and mu {mu[i]:g}; {requirement}"
+            )
     if not tangents.size or (tangents == tangents[0]).all():
         count = int(tangents[0]) if tangents.size else 2
         return Cones.contacts(mu, count, patch_radius, rolling=rolling, shape=shape)
     ptr = np.append(0, np.cumsum(1 + tangents + has_spin + 2 * has_rolling))
     kind = get_block_kinds(np.ones(len(mu), bool), spin=has_spin, rolling=has_rolling)
-    infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(len(mu))
+    infinite = np.full(int(ptr[-1]), np.inf)
+    zeros = np.zeros(len(mu))
     radius = zeros if patch_radius is None else patch_radius
     cones = Cones(ptr, kind, -infinite, infinite, mu=mu, patch_radius=radius, rolling=rolling)
     return cones.shaped(shape) if shape == "box" else cones

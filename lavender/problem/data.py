@@ -104,19 +104,35 @@ class ProblemData:
     derived: Derived = field(init=False, repr=False)
 
     def __init__(
-        self, b: ArrayLike, cones: Cones, matrix: Any = None, rows: Rows | None = None, friction: str = "coulomb",
-        compliance: ArrayLike | None = None, guess: ArrayLike | None = None, key: Any = None,
-        names: Sequence[str] | None = None, name: str = "", copy: bool = True, generalized: Generalized | None = None,
-        precision: str = "", qp: Any = None, angular: ArrayLike | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        b: ArrayLike,
+        cones: Cones,
+        matrix: Any = None,
+        rows: Rows | None = None,
+        friction: str = "coulomb",
+        compliance: ArrayLike | None = None,
+        guess: ArrayLike | None = None,
+        key: Any = None,
+        names: Sequence[str] | None = None,
+        name: str = "",
+        copy: bool = True,
+        generalized: Generalized | None = None,
+        precision: str = "",
+        qp: Any = None,
+        angular: ArrayLike | None = None,
+    ) -> None:
         if not isinstance(cones, Cones):
-            raise InputError(f"cones is a {type(cones).__name__}; a lavender.Cones is needed: Cones.contacts")
+            raise InputError(
+                f"cones is a {type(cones).__name__}; a lavender.Cones is needed: Cones.contacts"
+            )
         m, k = cones.n_rows, cones.n_blocks
         rhs = as_array("b", b, (m,), unit="m/s", copy=copy)
         check_rhs(rhs)
         missing = (matrix is None) + (rows is None) + (generalized is None)
         if missing != 2:
-            raise InputError(f"{3 - missing} of matrix=, rows= and generalized= are given; one is needed")
+            raise InputError(
+                f"{3 - missing} of matrix=, rows= and generalized= are given; one is needed"
+            )
         if not isinstance(friction, str) or friction not in FRICTION_LAWS:
             hint = " (a separate bound for each tangent is a shape of the contacts: shape='box')"
             is_shape = isinstance(friction, str) and friction in ("box", "pyramid", "pyramidal")
@@ -132,12 +148,27 @@ class ProblemData:
             raise InputError("a round cone of more than two tangents needs friction='cone'")
         # `copy` applies to this call only: problems derived from this one copy by default.
         fields = self.__dict__
-        fields.update({
-            "b": rhs, "cones": cones, "matrix": matrix, "rows": rows, "friction": friction, "compliance": None,
-            "guess": None, "key": None, "names": names, "name": str(name), "copy": True, "generalized": generalized,
-            "precision": precision, "qp": qp, "angular": angular, "derived": Derived(),
-            "law": _find_law(cones, friction),
-        })  # fmt: skip
+        fields.update(
+            {
+                "b": rhs,
+                "cones": cones,
+                "matrix": matrix,
+                "rows": rows,
+                "friction": friction,
+                "compliance": None,
+                "guess": None,
+                "key": None,
+                "names": names,
+                "name": str(name),
+                "copy": True,
+                "generalized": generalized,
+                "precision": precision,
+                "qp": qp,
+                "angular": angular,
+                "derived": Derived(),
+                "law": _find_law(cones, friction),
+            }
+        )
         if matrix is None:
             soft = 0.0 if compliance is None else compliance
             fields["compliance"] = as_array("compliance", soft, (m,), unit="1/kg", copy=copy)
@@ -148,7 +179,9 @@ class ProblemData:
             self._check_rows(rows, k)
         elif generalized is not None:
             if not isinstance(generalized, Generalized):
-                raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
+                raise InputError(
+                    f"generalized is a {type(generalized).__name__}; a Generalized is needed"
+                )
             if generalized.m != m:
                 raise InputError(f"J has {generalized.m} rows; {m} are needed, as the cones have")
             self._set_view()
@@ -180,10 +213,17 @@ class ProblemData:
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         kj = rows.n_joints
-        if kj + rows.n_contacts == k and are_joints_then_contacts(self.cones._blocks, rows.joint_ptr):
+        if kj + rows.n_contacts == k and are_joints_then_contacts(
+            self.cones._blocks, rows.joint_ptr
+        ):
             return
         contact = self.cones.is_contact
-        if kj + rows.n_contacts != k or contact[:kj].any() or not contact[kj:].all() or self.cones.has_round:
+        if (
+            kj + rows.n_contacts != k
+            or contact[:kj].any()
+            or not contact[kj:].all()
+            or self.cones.has_round
+        ):
             raise InputError(
                 f"rows has {kj} joints and {rows.n_contacts} contacts, and cones has {k} blocks; a block of "
                 "bounded rows for each joint, then a contact block (not ROUND) for each contact are needed"
@@ -210,7 +250,13 @@ class ProblemData:
     @property
     def operator(self) -> str:
         """Form of A: "rows", "matrix" or "generalized" (see `OPERATORS`)."""
-        return "rows" if self.rows is not None else "matrix" if self.generalized is None else "generalized"
+        return (
+            "rows"
+            if self.rows is not None
+            else "matrix"
+            if self.generalized is None
+            else "generalized"
+        )
 
     @property
     def has_singular_program(self) -> bool:
@@ -248,11 +294,17 @@ class ProblemData:
         InputError
             The array has a wrong shape or is not finite, or the impulses cannot be assigned to the blocks.
         """
-        if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
+        if (
+            type(impulse) is np.ndarray
+            and impulse.dtype == np.float64
+            and impulse.shape == self.b.shape
+        ):
             copied = impulse.copy()
             if not finite or measure.all_finite(copied):
                 return copied
-        is_pair = isinstance(impulse, tuple) and len(impulse) == 2 and isinstance(impulse[0], ProblemData)
+        is_pair = (
+            isinstance(impulse, tuple) and len(impulse) == 2 and isinstance(impulse[0], ProblemData)
+        )
         if is_pair or (hasattr(impulse, "impulse") and hasattr(impulse, "residual")):
             return self.carry(impulse)
         shape = get_shape(name, impulse)
@@ -289,7 +341,9 @@ class ProblemData:
         """
         block = check_int("block", block, high=self.n_blocks - 1)
         return (
-            self.names[block] if self.names else self.row_name(int(self.cones.ptr[block])).rsplit(", ", 1)[0]
+            self.names[block]
+            if self.names
+            else self.row_name(int(self.cones.ptr[block])).rsplit(", ", 1)[0]
         )
 
     def row_name(self, row: int) -> str:
@@ -301,10 +355,13 @@ class ProblemData:
             The problem has no such row.
         """
         block = self.block_of(row)
-        offset, size = row - int(self.cones.ptr[block]), int(np.diff(self.cones.ptr)[block])
+        offset = row - int(self.cones.ptr[block])
+        size = int(np.diff(self.cones.ptr)[block])
         spin, roll = self.cones.spin_rows[block], self.cones.rolling_rows[block]
         if not self.cones.is_contact[block]:
-            name = self.names[block] if self.names else f"row {row}" if size == 1 else f"joint {block}"
+            name = (
+                self.names[block] if self.names else f"row {row}" if size == 1 else f"joint {block}"
+            )
             return name if size == 1 else f"{name}, axis {offset}"
         first_contact = 0 if self.rows is None else self.rows.n_joints
         if self.generalized is not None:
@@ -349,7 +406,11 @@ class ProblemData:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):
             return NotImplemented
-        compared = (f.name for f in fields(self) if f.init and f.compare and f.name not in ("matrix", "copy"))
+        compared = (
+            f.name
+            for f in fields(self)
+            if f.init and f.compare and f.name not in ("matrix", "copy")
+        )
         if not all(are_equal(getattr(self, name), getattr(other, name)) for name in compared):
             return False
         if issparse(self.matrix) and issparse(other.matrix):
@@ -400,7 +461,9 @@ def _convert_keys(key: Any, k: int) -> np.ndarray:
     check_unmasked("key", key)
     array = np.asarray(key)
     if array.shape != (k,) or array.dtype.kind not in "ui":
-        raise InputError(f"key has shape {array.shape} and dtype {array.dtype}; ({k},) integers are needed")
+        raise InputError(
+            f"key has shape {array.shape} and dtype {array.dtype}; ({k},) integers are needed"
+        )
     if array.dtype.kind == "i" and array.size and array.min() < 0:
         i = int(array.argmin())
         raise InputError(f"key has {array[i]} at [{i}]; integers from 0 to 2**64 - 1 are needed")
@@ -419,7 +482,9 @@ def check_rhs(b: FloatArray) -> None:
 
 for _name in ("b", "cones", "generalized", "compliance", "key", "names", "angular"):
     setattr(ProblemData, _name, late_field(_name))  # Importers postpone these fields.
-ProblemData.__init__.__qualname__ = "Problem.__init__"  # Makes a TypeError name the class that users call.
+ProblemData.__init__.__qualname__ = (
+    "Problem.__init__"  # Makes a TypeError name the class that users call.
+)
 
 
 def check_problem(problem: Any) -> None:
@@ -432,7 +497,9 @@ def check_problem(problem: Any) -> None:
         elif callable(getattr(problem, "velocity_after", None)):
             # The object is a `RowBuilder`, which is not imported here.
             advice = "give the result of its .problem()"
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
+        raise InputError(
+            f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}"
+        )
 
 
 def check_matrix(matrix: Any, m: int, copy: bool) -> Any:
@@ -442,5 +509,9 @@ def check_matrix(matrix: Any, m: int, copy: bool) -> Any:
     if matrix.shape != (m, m):
         raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")
     return as_csr(
-        "A", matrix, copy=copy, unit="1/kg", too_many="; give J and M^-1 instead (Problem.from_rows)"
+        "A",
+        matrix,
+        copy=copy,
+        unit="1/kg",
+        too_many="; give J and M^-1 instead (Problem.from_rows)",
     )

@@ -58,8 +58,12 @@ class cached_property(Generic[T]):
     that is forked at that moment waits forever.
     """
 
-    def __init__(self, function: Callable[[Any], T], name: str = "", is_locked: bool = False) -> None:
-        self.function, self.name, self.is_locked = function, name or function.__name__, is_locked
+    def __init__(
+        self, function: Callable[[Any], T], name: str = "", is_locked: bool = False
+    ) -> None:
+        self.function = function
+        self.name = name or function.__name__
+        self.is_locked = is_locked
         self.__doc__ = function.__doc__
 
     @overload

@@ -23,9 +23,13 @@ def order_findex_rows(findex: Any, count: int | None = None) -> IntArray:
     for i in rows:
         j = int(findex[i])
         if j >= m:
-            raise InputError(f"findex[{i}] is {j}; a row below {m} is needed, or -1 for constant bounds")
+            raise InputError(
+                f"findex[{i}] is {j}; a row below {m} is needed, or -1 for constant bounds"
+            )
         if j == i:
-            raise InputError(f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1")
+            raise InputError(
+                f"findex[{i}] is {i}, its own row; the row of its normal is needed, or -1"
+            )
         if findex[j] >= 0:
             raise InputError(
                 f"findex[{i}] is {j}, a row with findex {findex[j]}; the row of a normal (findex -1) is needed"
@@ -73,7 +77,8 @@ def convert_from_findex(lower: Any, upper: Any, findex: Any, m: int) -> tuple[In
     for tangent in (0, 1):
         blocks = np.flatnonzero(size > 1 + tangent)
         mu[blocks, tangent] = high[order[ptr[blocks] + 1 + tangent]]
-    box, is_box = Cones.contacts(mu, shape="box"), size == 3
+    box = Cones.contacts(mu, shape="box")
+    is_box = size == 3
     return order, Cones(
         ptr=ptr,
         kind=get_block_kinds(size > 1, box=is_box),
@@ -91,7 +96,8 @@ def convert_to_findex(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
         raise InputError(f"block {disks[0]} is a disk; a box is needed: cones.shaped('box')")
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)
-    rows, coefficient = np.flatnonzero(cones.friction_rows), cones.friction_coefficient.copy()
+    rows = np.flatnonzero(cones.friction_rows)
+    coefficient = cones.friction_coefficient.copy()
     first_tangent = cones.ptr[:-1][cones.is_box] + 1
     # A tangent without friction gets exactly 0.
     coefficient[first_tangent] = cones.coefficients[cones.is_box, 0]

@@ -7,7 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_int, check_nonnegative_magnitudes, get_shape
+from lavender.base.arrays import (
+    FloatArray,
+    as_array,
+    check_int,
+    check_nonnegative_magnitudes,
+    get_shape,
+)
 from lavender.base.errors import InputError, check_name
 from lavender_ext.core import blocks as kernels
 
@@ -26,7 +32,9 @@ def _convert_coefficient_pairs(mu: Any) -> FloatArray:
     array = as_array("mu", mu, (None,) * np.ndim(mu))
     check_nonnegative_magnitudes("mu", array, "-")
     if array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(f"mu has shape {array.shape}; (k,) or (k, 2), one for each tangent, is needed")
+        raise InputError(
+            f"mu has shape {array.shape}; (k,) or (k, 2), one for each tangent, is needed"
+        )
     return array
 
 
@@ -55,16 +63,26 @@ def make_contact_blocks(
     has_spin, has_rolling = patch_radius is not None, rolling is not None
     if has_spin or has_rolling or tangents != 2:
         if is_box and (has_spin or has_rolling or tangents > 2):
-            raise InputError("a box has up to two tangents, without spin (patch_radius) and rolling")
+            raise InputError(
+                "a box has up to two tangents, without spin (patch_radius) and rolling"
+            )
         if is_pair and not is_box:
-            raise InputError(f"mu has shape {np.shape(mu)}, of ellipses; (k,) is needed with spin or rolling")
+            raise InputError(
+                f"mu has shape {np.shape(mu)}, of ellipses; (k,) is needed with spin or rolling"
+            )
         if tangents > 2 and has_spin:
-            raise InputError(f"{tangents} tangents make a round cone, which has spin: leave patch_radius out")
+            raise InputError(
+                f"{tangents} tangents make a round cone, which has spin: leave patch_radius out"
+            )
         if has_rolling and tangents != 2:
-            raise InputError(f"tangents is {tangents}; rolling needs tangents=2, the axes of rolling")
-    ratio, pair_kind = None, 0
+            raise InputError(
+                f"tangents is {tangents}; rolling needs tangents=2, the axes of rolling"
+            )
+    ratio = None
+    pair_kind = 0
     if is_box and tangents == 2:
-        pair_kind, ratio = BOX_KIND, np.ones(1)
+        pair_kind = BOX_KIND
+        ratio = np.ones(1)
         if is_pair:
             mu, second = _convert_coefficient_pairs(mu).T
             smallest = MIN_COEFFICIENT_RATIO * second
@@ -95,12 +113,19 @@ def project_impulse(cones: Any, impulse: FloatArray) -> FloatArray:
     the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
     """
     if cones.has_ellipse:
-        return cones.stretch * project_impulse(cones.ellipses_replaced_by_disks, impulse / cones.stretch)
+        return cones.stretch * project_impulse(
+            cones.ellipses_replaced_by_disks, impulse / cones.stretch
+        )
     out: FloatArray = np.clip(impulse, cones.lower, cones.upper)
-    first, tangents = cones.ptr[:-1], cones.n_together
-    groups = [(tangents == width, first + 1, width) for width in range(1, int(tangents.max(initial=0)) + 1)]
+    first = cones.ptr[:-1]
+    tangents = cones.n_together
+    groups = [
+        (tangents == width, first + 1, width)
+        for width in range(1, int(tangents.max(initial=0)) + 1)
+    ]
     groups += [
-        (rows >= 0, rows, width) for rows, width in ((cones.separate_rows, 1), (cones.rolling_rows, 2))
+        (rows >= 0, rows, width)
+        for rows, width in ((cones.separate_rows, 1), (cones.rolling_rows, 2))
     ]
     for has_component, first_row, width in groups:
         rows = first_row[has_component][:, None] + np.arange(width)

@@ -85,7 +85,9 @@ class Generalized:
     order: IntArray | None
     operator: kernels.Operator
 
-    def __init__(self, jac: Any, mass: Any, v_free: Any, names: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, jac: Any, mass: Any, v_free: Any, names: Sequence[str] | None = None
+    ) -> None:
         lower, n = _convert_mass(mass, names)
         free = as_array("v_free", v_free, (n,), unit="m/s, rad/s")
         self._initialize(_convert_jacobian(jac, n), lower, free, names)
@@ -112,7 +114,9 @@ class Generalized:
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
             if as_plain_array(x, ANY_LENGTH, True, False) is None:
-                as_array(name, x, ANY_LENGTH, copy=False)  # Raises an InputError that names the entry.
+                as_array(
+                    name, x, ANY_LENGTH, copy=False
+                )  # Raises an InputError that names the entry.
         free = as_plain_array(v_free, (n,), True, False)
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
@@ -137,9 +141,13 @@ class Generalized:
             free = as_array("v_free", free, self.v_free.shape, unit="m/s, rad/s")
             return make_instance(Generalized, self.__dict__ | {"v_free": free})
         if self.order is not None:
-            return Generalized(jac, self.mass, self.v_free if v_free is None else v_free, self.names)
+            return Generalized(
+                jac, self.mass, self.v_free if v_free is None else v_free, self.names
+            )
         velocity = (
-            self.v_free if v_free is None else as_array("v_free", v_free, (self.nv,), unit="m/s, rad/s")
+            self.v_free
+            if v_free is None
+            else as_array("v_free", v_free, (self.nv,), unit="m/s, rad/s")
         )
         new = object.__new__(Generalized)
         new._initialize(_convert_jacobian(jac, self.nv), self.operator.mass, velocity, self.names)
@@ -153,9 +161,16 @@ class Generalized:
         if not is_nonzero.all():  # Remove entries that underflowed to zero when they were scaled.
             indptr = np.append(0, np.cumsum(is_nonzero))[indptr].astype(np.int32)
             indices, data = indices[is_nonzero], data[is_nonzero]
-        operator = kernels.Operator(indptr, indices, mark_read_only(data), *self.operator.mass, self.operator)
+        operator = kernels.Operator(
+            indptr, indices, mark_read_only(data), *self.operator.mass, self.operator
+        )
         operator.share_factor(self.operator)
-        attributes = {"v_free": self.v_free, "names": self.names, "order": self.order, "operator": operator}
+        attributes = {
+            "v_free": self.v_free,
+            "names": self.names,
+            "order": self.order,
+            "operator": operator,
+        }
         return make_instance(Generalized, attributes)
 
     def with_diagonal_shift(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
@@ -171,7 +186,9 @@ class Generalized:
         operator = kernels.Operator(*self.operator.jac, indptr, indices, data, self.operator)
         new.__dict__.update(names=self.names, order=self.order, operator=operator)
         new._factor()
-        new.__dict__["v_free"] = self.v_free if momentum is None else mark_read_only(new.solve(momentum))
+        new.__dict__["v_free"] = (
+            self.v_free if momentum is None else mark_read_only(new.solve(momentum))
+        )
         return new
 
     def _initialize(
@@ -183,7 +200,8 @@ class Generalized:
         like: kernels.Operator | None = None,
     ) -> None:
         """Set all attributes from checked arrays, and factor M."""
-        n, attributes = len(v_free), self.__dict__
+        n = len(v_free)
+        attributes = self.__dict__
         attributes["v_free"] = v_free
         attributes["names"] = None if names is None else as_names("velocities", names, n)
         self._make_operator(jac, mass, n, like)
@@ -203,9 +221,12 @@ class Generalized:
             indptr, indices, _ = mass
             lower = sp.csr_array((np.ones(len(indices), np.int32), indices, indptr), shape=(n, n))
             order = _order_by_degree(sp.csr_array(lower + lower.T))
-            reordered = kernels.Operator(*_permute_columns(jac, order), *_permute_lower(mass, order))
+            reordered = kernels.Operator(
+                *_permute_columns(jac, order), *_permute_lower(mass, order)
+            )
             if operator is None or reordered.fill < operator.fill:
-                attributes["order"], operator = mark_read_only(order), reordered
+                attributes["order"] = mark_read_only(order)
+                operator = reordered
         if n >= MIN_TREE_ORDERING_VELOCITIES and attributes["order"] is None:
             tree_order = _order_trees(jac, operator.parents)
             if tree_order is not None:
@@ -229,7 +250,9 @@ class Generalized:
         raise AttributeError(f"{name} of a Generalized cannot be set: make another one")
 
     def __delattr__(self, name: str) -> None:
-        raise AttributeError(f"{name} of a Generalized cannot be deleted, because the object is immutable")
+        raise AttributeError(
+            f"{name} of a Generalized cannot be deleted, because the object is immutable"
+        )
 
     @property
     def m(self) -> int:
@@ -252,7 +275,9 @@ class Generalized:
         indptr, indices, data = self.operator.jac
         if self.order is not None:
             # Copy the data, because kernels read this array and `sort_indices` works in place.
-            original = sp.csr_array((data.copy(), self.order[indices], indptr), shape=(self.m, self.nv))
+            original = sp.csr_array(
+                (data.copy(), self.order[indices], indptr), shape=(self.m, self.nv)
+            )
             original.sort_indices()
             indices, data = original.indices, original.data
         arrays = mark_read_only(data), mark_read_only(indices), mark_read_only(indptr)
@@ -285,7 +310,9 @@ class Generalized:
     def velocity_of(self, v: FloatArray) -> FloatArray:
         """Compute J v (m,) [m/s, rad/s] for velocities v (nv,)."""
         v = as_array("v", v, (self.nv,), finite=False)
-        out: FloatArray = self.operator.multiply_jacobian(v if self.order is None else v[self.order])
+        out: FloatArray = self.operator.multiply_jacobian(
+            v if self.order is None else v[self.order]
+        )
         return out
 
     def bias(self, target: Any) -> FloatArray:
@@ -322,7 +349,9 @@ class Generalized:
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """Compute the velocity change M^-1 J^T impulse (nv,) [m/s, rad/s] by impulses (m,)."""
-        x = self.operator.multiply_jacobian_transpose(as_array("impulse", impulse, (self.m,), finite=False))
+        x = self.operator.multiply_jacobian_transpose(
+            as_array("impulse", impulse, (self.m,), finite=False)
+        )
         self.operator.solve(x)
         return self._in_original_order(x)
 
@@ -373,22 +402,31 @@ class Generalized:
 
 def _convert_jacobian(jac: Any, n: int) -> Compressed:
     """Convert J to checked compressed rows."""
-    array, compressed = jac, dense_to_csr(jac)
+    array = jac
+    compressed = dense_to_csr(jac)
     if compressed is None:
         array = jac if issparse(jac) else as_array_view("J", jac, (None, None))
     if len(array.shape) != 2 or array.shape[1] != n:
-        raise InputError(f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities")
+        raise InputError(
+            f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities"
+        )
     if compressed is None:
-        compressed = convert_to_compressed_rows("J", array) if issparse(jac) else dense_to_csr(array)
+        compressed = (
+            convert_to_compressed_rows("J", array) if issparse(jac) else dense_to_csr(array)
+        )
     return compressed
 
 
 def _convert_mass(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     """Return the checked lower triangle of M and the number of velocities."""
     blocks: Sequence[Any] = mass if isinstance(mass, (list, tuple)) else (mass,)
-    max_asymmetry = MAX_ASYMMETRY_FLOAT32 if get_common_precision(*blocks) == "float32" else MAX_ASYMMETRY
+    max_asymmetry = (
+        MAX_ASYMMETRY_FLOAT32 if get_common_precision(*blocks) == "float32" else MAX_ASYMMETRY
+    )
     if blocks is mass and blocks and all(np.ndim(block) == 2 for block in blocks):
-        arrays = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(blocks)]
+        arrays = [
+            as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(blocks)
+        ]
         # Convert the blocks to sparse arrays, because SciPy 1.18 warns about dense blocks.
         mass = sp.block_diag([sp.coo_array(block) for block in arrays], format="csr")
     hint = "give both triangles (Pinocchio's crba fills the upper one)"
@@ -454,7 +492,8 @@ def _permute_lower(mass: Compressed, order: IntArray) -> Compressed:
     """Permute rows and columns of a symmetric matrix given by its lower triangle."""
     indptr, indices, data = mass
     position = np.argsort(order)
-    rows, cols = position[np.repeat(np.arange(len(order)), np.diff(indptr))], position[indices]
+    rows = position[np.repeat(np.arange(len(order)), np.diff(indptr))]
+    cols = position[indices]
     return _compress_entries(np.maximum(rows, cols), np.minimum(rows, cols), data, len(order))
 
 
@@ -470,9 +509,9 @@ def _order_by_degree(graph: sp.csr_array) -> IntArray:
     graph.setdiag(0)
     graph.eliminate_zeros()
     graph.sort_indices()
-    order: IntArray = order_for_elimination(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[
-        ::-1
-    ]
+    order: IntArray = order_for_elimination(
+        graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
+    )[::-1]
     return order
 
 
@@ -491,10 +530,12 @@ def _order_trees(jac: Compressed, parent: IntArray) -> IntArray | None:
     The order of trees does not change the fill-in of M, but that of Newton's matrix N = M + J^T V J, which couples
     trees that share a row (for example the vertices of a flex, each of which is a tree).
     """
-    roots, tree = np.flatnonzero(parent < 0), _label_trees(parent)
+    roots = np.flatnonzero(parent < 0)
+    tree = _label_trees(parent)
     indptr, indices, _ = jac
     trees_of_row = sp.csr_array(
-        (np.ones(len(indices), np.int32), tree[indices], indptr.copy()), shape=(len(indptr) - 1, len(roots))
+        (np.ones(len(indices), np.int32), tree[indices], indptr.copy()),
+        shape=(len(indptr) - 1, len(roots)),
     )
     trees_of_row.sum_duplicates()
     couplings = np.sum(np.diff(trees_of_row.indptr).astype(float) ** 2)

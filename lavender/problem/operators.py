@@ -27,13 +27,33 @@ from lavender_ext.judge import measure
 SEMIDEFINITE_SHIFT = 1e-12
 # If entries of J and M^-1 do not exceed this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 MAX_SAFE_ENTRY = 1e15
-MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
+MAX_INDEXABLE_ENTRIES = (
+    2**31
+)  # A with this many entries or more is not formed: its indices have 32 bits.
 # Fields and cached properties that depend neither on the law of friction nor on b, and those that do not depend on b.
-SHARED_ARRAYS = ("csr", "jacobian", "whitened", "bandwidth", "_compressed", "_couplings", "_matrix_asymmetry")
+SHARED_ARRAYS = (
+    "csr",
+    "jacobian",
+    "whitened",
+    "bandwidth",
+    "_compressed",
+    "_couplings",
+    "_matrix_asymmetry",
+)
 FIELDS_BESIDES_RHS = (
-    "cones", "matrix", "rows", "friction", "compliance", "key", "names", "name", "copy", "precision", "law",
+    "cones",
+    "matrix",
+    "rows",
+    "friction",
+    "compliance",
+    "key",
+    "names",
+    "name",
+    "copy",
+    "precision",
+    "law",
     "angular",
-)  # fmt: skip
+)
 # Key in `Derived.cache` of the values of FIELDS_BESIDES_RHS, for the next problem with another b.
 BESIDES_RHS_KEY = "lavender.problem.operators: fields besides b"
 
@@ -45,7 +65,9 @@ class Operators(ProblemData):
         """Raise InputError now, not in a solve, if large entries of J, M^-1 or the compliance make A_ii too large."""
         r, general, c = self.rows, self.generalized, self.compliance
         if general is not None:
-            is_large = general.operator.has_entry_above(MAX_SAFE_ENTRY) or has_entry_above(MAX_SAFE_ENTRY, c)
+            is_large = general.operator.has_entry_above(MAX_SAFE_ENTRY) or has_entry_above(
+                MAX_SAFE_ENTRY, c
+            )
         else:
             is_large = r is not None and has_entry_above(
                 MAX_SAFE_ENTRY, c, r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia
@@ -60,13 +82,22 @@ class Operators(ProblemData):
         The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`. `rest` is a function and its
         arguments; the function returns b, cones, generalized, compliance, key and names when one of them is first read.
         """
-        return make_instance(cls, {
-            "derived": Derived(view), "friction": friction, "precision": "float64", "name": name, "_rest": rest,
-        })  # fmt: skip
+        return make_instance(
+            cls,
+            {
+                "derived": Derived(view),
+                "friction": friction,
+                "precision": "float64",
+                "name": name,
+                "_rest": rest,
+            },
+        )
 
     def _share_operator(self, other: Operators) -> None:
         """Give a problem with the same A, and another law or b, the arrays of this one that depend on neither."""
-        known, law, b = self.__dict__, FRICTION_NUMBER[other.friction], other.b
+        known = self.__dict__
+        law = FRICTION_NUMBER[other.friction]
+        b = other.b
         for name in SHARED_ARRAYS:
             if name in known:
                 other.__dict__[name] = known[name]
@@ -97,7 +128,13 @@ class Operators(ProblemData):
             name: getattr(self, name) for name in FIELDS_BESIDES_RHS
         }
         derived.cache[BESIDES_RHS_KEY] = same
-        values = {"b": b, "generalized": generalized, "guess": guess, "derived": derived, "qp": None}
+        values = {
+            "b": b,
+            "generalized": generalized,
+            "guess": guess,
+            "derived": derived,
+            "qp": None,
+        }
         other: Operators = make_instance(type(self), same | values)
         self._share_operator(other)
         if generalized is not None and derived.view is None:
@@ -165,7 +202,16 @@ class Operators(ProblemData):
             return self.csr_data
         r = self.rows
         arms, masses = (r.arm_a, r.arm_b), (r.inv_mass, r.inv_inertia)
-        rows = r.jac, r.joint_body, r.normal, r.tangent, *arms, r.contact_body, *masses, self.compliance
+        rows = (
+            r.jac,
+            r.joint_body,
+            r.normal,
+            r.tangent,
+            *arms,
+            r.contact_body,
+            *masses,
+            self.compliance,
+        )
         data = self._make_data(rows=rows)
         self._check_diagonal(data)
         return data
@@ -189,7 +235,9 @@ class Operators(ProblemData):
         try:
             view.compute_derived_numbers()
         except OverflowError as error:
-            raise TooLarge(f"the problem is too large: {error}: split it, for example by islands") from None
+            raise TooLarge(
+                f"the problem is too large: {error}: split it, for example by islands"
+            ) from None
         self._check_diagonal(view)
         return view
 
@@ -236,7 +284,9 @@ class Operators(ProblemData):
     def check_matrix_fits(self) -> None:
         """Raise TooLarge if A in compressed rows may have more entries than 32-bit indices reach."""
         if self.matrix is None and "_compressed" not in self.__dict__:
-            bound = self._couplings[0] if self.generalized is None else self.metric.entries_of_matrix
+            bound = (
+                self._couplings[0] if self.generalized is None else self.metric.entries_of_matrix
+            )
             self._check_entry_count(bound)
 
     def _check_entry_count(self, bound: float) -> None:
@@ -244,7 +294,9 @@ class Operators(ProblemData):
         # Pairs of blocks that share both bodies were counted twice. Rows of J without entries have a diagonal entry.
         if min(bound + self.m, self.m**2) >= MAX_INDEXABLE_ENTRIES:
             data = "rows" if self.generalized is None else "J and M"
-            raise TooLarge(f"A may have {bound:.3g} entries, above 2^31 - 1: use a solver that takes {data}")
+            raise TooLarge(
+                f"A may have {bound:.3g} entries, above 2^31 - 1: use a solver that takes {data}"
+            )
 
     @computed_once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
@@ -257,7 +309,9 @@ class Operators(ProblemData):
             self._check_entry_count(self.metric.entries_of_matrix)
             # A kernel is used instead of SciPy, which a first solve with a time limit would have to import.
             y = self.metric.whitened()
-            arrays = assemble.form_gram_matrix(*y, self.generalized.nv, self.compliance, FORMING.deadline)
+            arrays = assemble.form_gram_matrix(
+                *y, self.generalized.nv, self.compliance, FORMING.deadline
+            )
             if arrays is None:
                 raise TooLate("the time limit ended the forming of A")
         elif self.rows is not None:
@@ -349,7 +403,9 @@ class Operators(ProblemData):
         """
         general = self.rows if self.generalized is None else self.generalized
         if general is None:
-            raise CapabilityError("this problem was given as a matrix; J and M are needed for velocities")
+            raise CapabilityError(
+                "this problem was given as a matrix; J and M are needed for velocities"
+            )
         return general.v_free + self.compute_velocity_change(self.make_start(impulse))
 
     def compute_velocity_change(self, impulse: FloatArray) -> FloatArray:
@@ -378,7 +434,9 @@ class Operators(ProblemData):
         else:
             relative = np.empty(self.m)
             multiply_body_jacobian(self.data, velocity, relative)
-        with np.errstate(over="ignore", invalid="ignore"):  # Large impulses may overflow without a warning.
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # Large impulses may overflow without a warning.
             return float(0.5 * (self.make_start(impulse) @ relative))
 
     def start(self) -> FloatArray:

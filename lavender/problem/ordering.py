@@ -52,7 +52,11 @@ class Order:
 
 
 def compute_block_order(
-    problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None
+    problem: Problem,
+    order: str | Sequence[int] | Any = "given",
+    *,
+    seed: int = 0,
+    ground: Any = None,
 ) -> Order:
     """Compute the sweep order of a problem's blocks.
 
@@ -73,14 +77,24 @@ def compute_block_order(
     """
     k = problem.cones._blocks.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
-    if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
-        return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
+    if (
+        type(order) is str
+        and order == "given"
+        and ground is None
+        and type(seed) is int
+        and seed == 0
+    ):
+        return Order(
+            np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True
+        )
     rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
         raise InputError(f"seed={seed} needs order='random': leave seed out")
     if not isinstance(order, str):
         if ground is not None:
-            raise InputError("ground= is given with an array; it needs order='bottom_up' or 'top_down'")
+            raise InputError(
+                "ground= is given with an array; it needs order='bottom_up' or 'top_down'"
+            )
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(
@@ -120,19 +134,25 @@ def compute_block_levels_from_ground(problem: Problem, ground: Any = None) -> In
     k = problem.n_blocks
     if problem.rows is not None:
         if ground is not None:
-            raise InputError("ground= is given with rows, whose static bodies are the ground: leave it out")
+            raise InputError(
+                "ground= is given with rows, whose static bodies are the ground: leave it out"
+            )
         return compute_block_levels(problem.rows.moving_block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError("levels of a matrix need ground=, the blocks that touch the ground")
     ground = as_array("ground", ground, (None,), dtype=np.int32)
     if ground.size and (ground.min() < 0 or ground.max() >= k):
-        raise InputError(f"ground holds block {ground.max()}; there are {k} blocks, numbered from 0")
+        raise InputError(
+            f"ground holds block {ground.max()}; there are {k} blocks, numbered from 0"
+        )
     if not ground.size:
         return np.zeros(k, np.int32)
     graph = _build_block_graph(problem)
     level = sp.csgraph.dijkstra(graph, unweighted=True, indices=np.unique(ground), min_only=True)
     # Blocks that do not touch others have a level of their own.
-    return np.where(np.isfinite(level), level, level[np.isfinite(level)].max() + 1.0).astype(np.int32)
+    return np.where(np.isfinite(level), level, level[np.isfinite(level)].max() + 1.0).astype(
+        np.int32
+    )
 
 
 # Bodies are renumbered if the numbers of two touching bodies differ by more than this on average. The velocities of a
@@ -155,7 +175,9 @@ def number_bodies_by_adjacency(problem: Problem) -> IntArray:
         return numbers
     graph = sp.csr_array((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), shape=(n, n))
     rank = np.empty(n, np.int32)
-    rank[sp.csgraph.reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = numbers
+    rank[sp.csgraph.reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = (
+        numbers
+    )
     return rank
 
 
@@ -168,7 +190,9 @@ def compute_small_bandwidth_block_order(problem: Problem) -> IntArray:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
         graph = sp.csr_matrix(_build_block_graph(problem))
-        return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
+        return np.ascontiguousarray(
+            sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32
+        )
     rank = np.append(number_bodies_by_adjacency(problem), np.int32(-1))
     pair = rank[problem.rows.moving_block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
@@ -184,7 +208,8 @@ def compute_block_colors(problem: Problem) -> IntArray:
     """
     if problem.rows is not None:
         return compute_body_colors(problem.rows.moving_block_bodies, problem.rows.n_bodies)
-    graph, numbers = _build_block_graph(problem), np.arange(problem.n_blocks + 1, dtype=np.int32)
+    graph = _build_block_graph(problem)
+    numbers = np.arange(problem.n_blocks + 1, dtype=np.int32)
     pattern = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
     return compute_matrix_colors(numbers, numbers[:-1], *pattern)
 

@@ -126,19 +126,28 @@ class Problem(Builders):
         True
         """
         if isinstance(previous, tuple) and len(previous) == 2 and isinstance(previous[0], Problem):
-            before, impulse = previous[0], previous[0].make_start(previous[1])
+            before = previous[0]
+            impulse = previous[0].make_start(previous[1])
         elif hasattr(previous, "residual") and hasattr(previous, "impulse"):
-            before, impulse = previous.residual._problem, previous.impulse  # pyright: ignore[reportAttributeAccessIssue]
+            before = previous.residual._problem  # pyright: ignore[reportAttributeAccessIssue]
+            impulse = previous.impulse
         else:
             given = "None" if previous is None else f"a {type(previous).__name__}"
-            hint = ": the first step has no start, solve it without impulse=" if previous is None else ""
-            raise InputError(f"previous is {given}; a Solution, or (problem, impulse), is needed{hint}")
+            hint = (
+                ": the first step has no start, solve it without impulse="
+                if previous is None
+                else ""
+            )
+            raise InputError(
+                f"previous is {given}; a Solution, or (problem, impulse), is needed{hint}"
+            )
         if keys is not None:
             if before.key is None:
                 raise InputError("the problem of the previous step has no keys: build it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
         start, *repeated = self._carry(before, impulse)
-        for name, problem, repeats in zip(("this problem", "the previous one"), (self, before), repeated):  # noqa: B905
+        checked = (("this problem", self), ("the previous one", before))
+        for (name, problem), repeats in zip(checked, repeated, strict=True):
             if repeats:
                 values, counts = np.unique(problem.key, return_counts=True)
                 raise InputError(
@@ -147,7 +156,9 @@ class Problem(Builders):
                 )
         if start is None:
             keyless = " and ".join(
-                name for name, p in (("this problem", self), ("the previous one", before)) if p.key is None
+                name
+                for name, p in (("this problem", self), ("the previous one", before))
+                if p.key is None
             )
             raise InputError(
                 f"no keys in {keyless}, and the blocks differ ({self.cones.n_blocks} now, {before.cones.n_blocks} "
@@ -162,7 +173,9 @@ class Problem(Builders):
             is_same = np.array_equal(old.kind, new.kind) and np.array_equal(old.ptr, new.ptr)
             return (impulse.copy() if is_same else None), False, False
         start = self.start()
-        return start, *carry_impulses_by_key(old._blocks, before.key, impulse, new._blocks, self.key, start)
+        return start, *carry_impulses_by_key(
+            old._blocks, before.key, impulse, new._blocks, self.key, start
+        )
 
     # -- other forms -----------------------------------------------------------------------------
 
@@ -213,7 +226,9 @@ class Problem(Builders):
     def _disk(self) -> Problem:
         """Problem in stretched tangents: A' = S A S, b' = S b, lambda = S lambda', w' = S w with S = diag(stretch)."""
         s, cones = self.cones.stretch, self.cones.ellipses_replaced_by_disks
-        changes: dict[str, Any] = {"guess": None if self.guess is None else self.on_disk(self.guess)}
+        changes: dict[str, Any] = {
+            "guess": None if self.guess is None else self.on_disk(self.guess)
+        }
         if self.generalized is None:
             indptr, indices, data = self._compressed
             data = np.repeat(s, np.diff(indptr)) * data * s[indices]
@@ -222,8 +237,13 @@ class Problem(Builders):
         else:
             assert self.compliance is not None
             compliance = s * s * self.compliance
-            compliance[compliance < MIN_MAGNITUDE] = 0.0  # A compliance must be 0 or at least MIN_MAGNITUDE.
-            changes |= {"generalized": self.generalized.with_scaled_rows(s), "compliance": compliance}
+            compliance[compliance < MIN_MAGNITUDE] = (
+                0.0  # A compliance must be 0 or at least MIN_MAGNITUDE.
+            )
+            changes |= {
+                "generalized": self.generalized.with_scaled_rows(s),
+                "compliance": compliance,
+            }
         disk = replace(self, b=s * self.b, cones=cones, copy=False, **changes)
         if self.rows is not None:
             disk.metric.copy_velocity_weight(self.metric, True)
@@ -256,13 +276,22 @@ class Problem(Builders):
             )
         lower, upper = np.where(c.friction_rows, [-bound, bound], [c.lower, c.upper])
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
-        more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {
-            "generalized": self.generalized, "compliance": self.compliance
-        }  # fmt: skip
+        more: dict[str, Any] = (
+            {"matrix": self.csr}
+            if self.generalized is None
+            else {"generalized": self.generalized, "compliance": self.compliance}
+        )
         return Problem(
-            self.b, Cones.bounded(lower, upper), guess=self.guess, names=names, name=self.name, copy=False,
-            precision=self.precision, angular=self.angular_rows, **more,
-        )  # fmt: skip
+            self.b,
+            Cones.bounded(lower, upper),
+            guess=self.guess,
+            names=names,
+            name=self.name,
+            copy=False,
+            precision=self.precision,
+            angular=self.angular_rows,
+            **more,
+        )
 
     def velocity_form(self) -> VelocityForm:
         """Compute the mass-scaled velocity form (see `VelocityForm`).

@@ -70,7 +70,9 @@ MAX_SINGULAR_PIVOT = 1e-13
 SEMIDEFINITE_SHIFT = 1e-12
 INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
 MAX_NAMED_ROWS = 8  # A message names up to this many rows.
-MAX_PROGRAM_ASYMMETRY = 1e-8  # [-] An asymmetry of P up to this multiple of its largest entry is removed.
+MAX_PROGRAM_ASYMMETRY = (
+    1e-8  # [-] An asymmetry of P up to this multiple of its largest entry is removed.
+)
 # Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
 MAX_EIGENVALUE_SIZE = 1000
 ProgramArrays = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
@@ -113,9 +115,7 @@ class QPSolution:
 
     def __str__(self) -> str:
         if self.ray is not None:
-            return (
-                f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
-            )
+            return f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
         # Show the status only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
         if status == "CONVERGED, ":
@@ -123,7 +123,9 @@ class QPSolution:
         verdict = "solved" if self.found else f"not solved to {self.tol:g}"
         conflict = "" if self.solution is None else self.solution.status_conflict
         conflict = f"; CONTRADICTED: {conflict}" if conflict else ""
-        return f"{verdict}: {status}error {self.error:.1e}, objective {self.objective:.6g}{conflict}"
+        return (
+            f"{verdict}: {status}error {self.error:.1e}, objective {self.objective:.6g}{conflict}"
+        )
 
     @cached_property
     def _judged(self) -> tuple[Any, ...]:
@@ -155,14 +157,16 @@ class QPSolution:
     @property
     def dual_residual(self) -> float:
         """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z."""
-        qp, lam = self.qp, self.qp.select_row_multipliers(self.impulse)
+        qp = self.qp
+        lam = self.qp.select_row_multipliers(self.impulse)
         residual = qp.generalized.momentum_of(self.x) + qp.q - qp.generalized.jac.T @ lam
         return float(np.append(np.abs(residual), -lam[qp.free :]).max(initial=0.0))
 
     @property
     def duality_gap(self) -> float:
         """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|."""
-        qp, lam = self.qp, self.qp.select_row_multipliers(self.impulse)
+        qp = self.qp
+        lam = self.qp.select_row_multipliers(self.impulse)
         return float(abs(self.x @ (qp.generalized.momentum_of(self.x) + qp.q) - qp.target @ lam))
 
     @property
@@ -206,7 +210,9 @@ class QuadraticProgram:
     # Number of rows of A and of G; None without A or G.
     n_equalities: int | None
     n_inequalities: int | None
-    variable: IntArray  # (m,) int: variable of each row of J that is a bound, -1 for rows of A and G.
+    variable: (
+        IntArray  # (m,) int: variable of each row of J that is a bound, -1 for rows of A and G.
+    )
     has_bounds: bool = False  # Whether lb or ub was given.
     kept: IntpArray | None = None  # (mi,) int or None: rows of G that are in J; None if all are.
     has_impossible_rows: bool = False  # Whether rows G x <= -inf were given, which became 0 <= -1.
@@ -217,13 +223,16 @@ class QuadraticProgram:
         if not self.is_singular:
             cones = _make_one_sided_cones(self.free, len(self.target))
             return {"b": general.bias(self.target), "cones": cones, "generalized": general}
-        n, jac = len(self.q), general.jac
+        n = len(self.q)
+        jac = general.jac
         matrix = sp.csr_array(sp.block_array([[general.mass, -jac.T], [jac, None]], format="csr"))
         matrix.eliminate_zeros()
         matrix.sort_indices()
         b = np.concatenate([-self.q, self.target])
         numbers = range(len(b))
-        names = Names(len(b), lambda: [f"variable {i}" if i < n else f"constraint {i - n}" for i in numbers])
+        names = Names(
+            len(b), lambda: [f"variable {i}" if i < n else f"constraint {i - n}" for i in numbers]
+        )
         cones = _make_one_sided_cones(n + self.free, len(b))
         return {"b": b, "cones": cones, "matrix": matrix, "names": names}
 
@@ -251,13 +260,16 @@ class QuadraticProgram:
     @property
     def arrays(self) -> dict[str, Any]:
         """P, q, and of G, h, A, b, lb, ub those that were given, for `Problem.from_qp`; G is 0 where h is infinite."""
-        n, target = len(self.q), self.target
+        n = len(self.q)
+        target = self.target
         P, J = _make_csr(self.hessian, n), _make_csr(self.jacobian, n)
         arrays = {"P": P, "q": self.q}
         if self.n_equalities is not None:
             arrays |= {"A": J[: self.n_equalities], "b": target[: self.n_equalities]}
         if self.has_bounds:
-            lb, ub, rows = np.full(n, -np.inf), np.full(n, np.inf), np.flatnonzero(self.variable >= 0)
+            lb = np.full(n, -np.inf)
+            ub = np.full(n, np.inf)
+            rows = np.flatnonzero(self.variable >= 0)
             sign = J.data[J.indptr[rows]]
             for side, chosen in ((lb, sign > 0.0), (ub, (sign < 0.0) | (rows < self.free))):
                 side[self.variable[rows[chosen]]] = (sign * target[rows])[chosen]
@@ -266,9 +278,12 @@ class QuadraticProgram:
             end = self.free + (self.n_inequalities if self.kept is None else len(self.kept))
             G, h = -J[self.free : end], -target[self.free : end]
             if self.kept is not None:
-                size, sides = np.zeros(self.n_inequalities, int), np.full(self.n_inequalities, np.inf)
-                size[self.kept], sides[self.kept] = np.diff(G.indptr), h
-                G, h = _make_csr((np.append(0, np.cumsum(size)), G.indices, G.data), n), sides
+                size = np.zeros(self.n_inequalities, int)
+                sides = np.full(self.n_inequalities, np.inf)
+                size[self.kept] = np.diff(G.indptr)
+                sides[self.kept] = h
+                G = _make_csr((np.append(0, np.cumsum(size)), G.indices, G.data), n)
+                h = sides
             arrays |= {"G": G, "h": h}
         return arrays
 
@@ -281,7 +296,9 @@ class QuadraticProgram:
     @cached_property
     def scales(self) -> tuple[FloatArray, FloatArray, float, float]:
         """Scales D (n,), E (m,), sigma and c of `equilibrate_program`."""
-        return equilibrate_program(self.hessian, self.q, self.jacobian, self.target, self.variable, self.free)
+        return equilibrate_program(
+            self.hessian, self.q, self.jacobian, self.target, self.variable, self.free
+        )
 
     def with_vectors(self, q: Any = None, h: Any = None, b: Any = None) -> QuadraticProgram:
         """Return the program with another q (n,), h (mi,) or b (me,); its matrices are shared, and h stays infinite."""
@@ -292,7 +309,9 @@ class QuadraticProgram:
         if b is not None:
             target[: self.n_equalities or 0] = as_array("b", b, (self.n_equalities or 0,))
         if h is not None and self.has_impossible_rows:
-            raise InputError("h of the program has an entry of -inf; a new program is needed for another h")
+            raise InputError(
+                "h of the program has an entry of -inf; a new program is needed for another h"
+            )
         if h is not None:
             h = as_array("h", h, (self.n_inequalities or 0,), finite=False)
             h = h if self.kept is None else h[self.kept]
@@ -324,7 +343,9 @@ class QuadraticProgram:
         A^T y + G^T z + z_box = 0 and b.y + h.z + (ub or lb).z_box < 0.
         """
         lam = np.ascontiguousarray(self.select_row_multipliers(impulse))
-        y, z, box = split_multipliers(self.jacobian, self.variable, None, len(self.q), self.free, lam)
+        y, z, box = split_multipliers(
+            self.jacobian, self.variable, None, len(self.q), self.free, lam
+        )
         if self.kept is not None:
             z_of_all_rows = np.zeros(self.n_inequalities or 0)
             z_of_all_rows[self.kept] = z
@@ -339,9 +360,11 @@ class QuadraticProgram:
         """Return the names of the rows with nonzero multipliers, such as A[0], G[3], lb[2]."""
         ptr, _, value = self.jacobian
         rows = np.flatnonzero(self.select_row_multipliers(impulse))
-        names, n_a = [], self.n_equalities or 0
+        names = []
+        n_a = self.n_equalities or 0
         for i in rows.tolist():
-            j, row = int(self.variable[i]), i - self.free
+            j = int(self.variable[i])
+            row = i - self.free
             bound = "ub" if j >= 0 and value[ptr[i]] < 0.0 else "lb"
             row = row if self.kept is None or j >= 0 or i < n_a else int(self.kept[row])
             names.append(f"{bound}[{j}]" if j >= 0 else f"A[{i}]" if i < n_a else f"G[{row}]")
@@ -360,10 +383,16 @@ class QuadraticProgram:
             impulse = as_array("impulse", solution, (size,))
         y, z, box = self.multipliers(impulse)
         return QPSolution(
-            x=self.recover_variables(impulse), y=y, z=z, z_box=box, solution=of_solution, ray=None,
-            impulse=impulse, qp=self,
+            x=self.recover_variables(impulse),
+            y=y,
+            z=z,
+            z_box=box,
+            solution=of_solution,
+            ray=None,
+            impulse=impulse,
+            qp=self,
             tol=tol,
-        )  # fmt: skip
+        )
 
 
 def _make_csr(rows: Any, n: int) -> Any:
@@ -399,15 +428,24 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         )
     jac, target, variable, n_fixed, n_kept, bad = stack_program(n, A, b, G, h, lb, ub)
     if bad >= 0:
-        raise InputError(f"variable {bad}: lb = {lb[bad]}, ub = {ub[bad]}; lb < inf and ub > -inf are needed")
+        raise InputError(
+            f"variable {bad}: lb = {lb[bad]}, ub = {ub[bad]}; lb < inf and ub > -inf are needed"
+        )
     general, is_singular = _factor_hessian(lower, jac, q)
     n_a, n_g = (None if side is None else len(side) for side in (b, h))
     return QuadraticProgram(
-        q=q, target=mark_read_only(target), free=n_fixed + (n_a or 0), generalized=general,
-        is_singular=is_singular, n_equalities=n_a, n_inequalities=n_g, variable=variable, has_bounds=has_bounds,
+        q=q,
+        target=mark_read_only(target),
+        free=n_fixed + (n_a or 0),
+        generalized=general,
+        is_singular=is_singular,
+        n_equalities=n_a,
+        n_inequalities=n_g,
+        variable=variable,
+        has_bounds=has_bounds,
         kept=None if h is None or n_kept == n_g else np.flatnonzero(h < INFINITE),
         has_impossible_rows=h is not None and bool(np.isneginf(h).any()),
-    )  # fmt: skip
+    )
 
 
 # -- conversion of arguments --------------------------------------------------------------------------
@@ -425,14 +463,18 @@ def _unpack_arguments(arguments: ProgramArrays) -> ProgramArrays:
             "P and q are needed, or a qpsolvers.Problem alone"
         )
     if any(x is not None for x in arguments[1:]):
-        raise InputError("a qpsolvers.Problem and further arrays are given; the former alone is needed")
+        raise InputError(
+            "a qpsolvers.Problem and further arrays are given; the former alone is needed"
+        )
     return tuple(getattr(P, name) for name in names)
 
 
 def _convert_hessian(P: Any, n: int) -> Compressed:
     """Return the lower triangle of P with its diagonal."""
     if get_shape("P", P) != (n, n):
-        raise InputError(f"P has shape {get_shape('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
+        raise InputError(
+            f"P has shape {get_shape('P', P)}; ({n}, {n}) is needed, as q has {n} entries"
+        )
     hint = "give both triangles or the upper one, or (P + P^T) / 2, which has the same x.P x"
     try:
         return extract_lower_triangle("P", P, hint)
@@ -453,15 +495,21 @@ def _convert_rows(
     """Convert A and b, or -G and h, to checked compressed rows and an array; None without them."""
     if (matrix is None) != (rhs is None):
         missing = name if matrix is None else rhs_name
-        raise InputError(f"{missing} is missing; both or neither of {name} and {rhs_name} are needed")
+        raise InputError(
+            f"{missing} is missing; both or neither of {name} and {rhs_name} are needed"
+        )
     if matrix is None:
         return None, None
     sparse = issparse(matrix)
     if not sparse:
         dense = as_array_view(name, matrix, (None,) * max(1, len(get_shape(name, matrix))))
-        matrix = dense[None] if dense.ndim == 1 else dense  # A one-dimensional array is a single row.
+        matrix = (
+            dense[None] if dense.ndim == 1 else dense
+        )  # A one-dimensional array is a single row.
     if len(matrix.shape) != 2 or matrix.shape[1] != n:
-        raise InputError(f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries")
+        raise InputError(
+            f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries"
+        )
     rows = convert_to_compressed_rows(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
     rhs = as_array(rhs_name, rhs, (len(rows[0]) - 1,), finite=name == "A")
     if name == "G" and not all_finite(rhs):
@@ -474,7 +522,8 @@ def _convert_rows(
 
 def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[Generalized, bool]:
     """Return J and M = P of (4), and whether P is singular and not factored; raise InputError for an indefinite P."""
-    momentum, unfactored = -q, Generalized.from_validated(jac, lower)
+    momentum = -q
+    unfactored = Generalized.from_validated(jac, lower)
     definite = _factor_shifted(unfactored, np.zeros(len(q)), momentum)
     if definite is not None and definite.operator.least_pivot > MAX_SINGULAR_PIVOT:
         return definite, False
@@ -490,7 +539,9 @@ def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[
     return unfactored, True
 
 
-def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
+def _factor_shifted(
+    unfactored: Generalized, d: FloatArray, momentum: FloatArray
+) -> Generalized | None:
     """Return J and P + diag(d), or None if that is not positive definite."""
     try:
         return unfactored.with_diagonal_shift(d, momentum)

@@ -45,9 +45,13 @@ PLANAR_VELOCITIES = (0, 1, 5)
 # Axes of rotation, or directions of travel, which two dimensions do not have, or which have two components.
 ROTATION_AXES = ("axis?", "axis_a?", "axis_b?")
 #: Ranges of numbers that may not be negative.
-RANGES = {name: {"low": 0.0} for name in ("length", "max_torque", "max_force", "stiffness", "damping", "mu")} | {
-    "restitution": {"low": 0.0, "high": 1.0}, "restitution_threshold": {"low": 0.0},
-}  # fmt: skip
+RANGES = {
+    name: {"low": 0.0}
+    for name in ("length", "max_torque", "max_force", "stiffness", "damping", "mu")
+} | {
+    "restitution": {"low": 0.0, "high": 1.0},
+    "restitution_threshold": {"low": 0.0},
+}
 #: Messages of the faults of row_blocks.pyx; `argument` is the one that a fault refers to, `given` its value.
 MESSAGES = {
     "axis_given": "{argument} is {given!r:.60}; in two dimensions all rotation is about z: leave it out",
@@ -78,7 +82,9 @@ def name_block(key: int) -> str:
     return f"{BLOCK_TYPES[key >> 60]} {key & MAX_FEATURE} of {places}"
 
 
-def _check_dimensions(position: tuple[int, ...], velocity: tuple[int, ...], inertia: tuple[int, ...]) -> None:
+def _check_dimensions(
+    position: tuple[int, ...], velocity: tuple[int, ...], inertia: tuple[int, ...]
+) -> None:
     """Check the shape of `position`; name it if the shapes of the other arguments belong to another dimension."""
     order = "the order is inv_mass, inv_inertia, velocity, dt, position"
     if len(position) == 2 and velocity == (position[0], {3: 2, 6: 3}.get(position[1])):
@@ -196,14 +202,26 @@ class RowBuilder:
     """
 
     def __init__(
-        self, inv_mass: ArrayLike, inv_inertia: ArrayLike, velocity: ArrayLike, dt: float, position: ArrayLike,
-        *, baumgarte: float = 0.2, slop: float = 0.0, velocity_before: ArrayLike | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        inv_mass: ArrayLike,
+        inv_inertia: ArrayLike,
+        velocity: ArrayLike,
+        dt: float,
+        position: ArrayLike,
+        *,
+        baumgarte: float = 0.2,
+        slop: float = 0.0,
+        velocity_before: ArrayLike | None = None,
+    ) -> None:
         shape = get_shape("position", position)
-        _check_dimensions(shape, get_shape("velocity", velocity), get_shape("inv_inertia", inv_inertia))
+        _check_dimensions(
+            shape, get_shape("velocity", velocity), get_shape("inv_inertia", inv_inertia)
+        )
         n, self._dimensions = shape[0], shape[1]
         if n > MAX_KEYED_BODIES:
-            raise InputError(f"position has {n} bodies; at most {MAX_KEYED_BODIES} are needed for keys")
+            raise InputError(
+                f"position has {n} bodies; at most {MAX_KEYED_BODIES} are needed for keys"
+            )
         self._position = np.zeros((n, 3))
         self._position[:, : shape[1]] = as_array("position", position, (n, shape[1]), unit="m")
         self._inv_mass = _as_inverses("inv_mass", inv_mass, n, "1/kg")
@@ -212,7 +230,8 @@ class RowBuilder:
             self._inv_inertia[:, 2, 2] = _as_inverses("inv_inertia", inv_inertia, n, "1/(kg m^2)")
         else:
             tensors = as_array("inv_inertia", inv_inertia, (n, 3, 3), unit="1/(kg m^2)")
-            none, empty = np.zeros((0, 2), np.int32), np.zeros((0, 3))
+            none = np.zeros((0, 2), np.int32)
+            empty = np.zeros((0, 3))
             if find_body_fault(self._inv_mass, tensors, none, none, empty, empty, True)[0]:
                 tensors = check_and_symmetrise_inertia("inv_inertia", tensors)
             self._inv_inertia = tensors
@@ -223,7 +242,13 @@ class RowBuilder:
         self._baumgarte = check_float("baumgarte", baumgarte, low=0.0, high=1.0)
         self._slop = check_float("slop", slop, low=0.0)
         self._blocks = RowBlocks(
-            self._position, self._velocity, before, self._dimensions, self._dt, self._baumgarte, self._slop
+            self._position,
+            self._velocity,
+            before,
+            self._dimensions,
+            self._dt,
+            self._baumgarte,
+            self._slop,
         )
         self._names: dict[int, str] = {}  # Names of blocks that were given, by key.
 
@@ -239,9 +264,15 @@ class RowBuilder:
     # -- joints --------------------------------------------------------------------------------------------------
 
     def ball(
-        self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
-        *, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor: ArrayLike,
+        anchor_b: ArrayLike | None = None,
+        *,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a ball joint: a point of b stays at a point of a; three rows, in two dimensions two.
 
         Parameters
@@ -266,10 +297,17 @@ class RowBuilder:
         return self._add("ball", a, b, feature, name, anchor, anchor_b)
 
     def hinge(
-        self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike | None = None,
-        anchor_b: ArrayLike | None = None, axis_b: ArrayLike | None = None,
-        *, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor: ArrayLike,
+        axis: ArrayLike | None = None,
+        anchor_b: ArrayLike | None = None,
+        axis_b: ArrayLike | None = None,
+        *,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a hinge: b rotates about an axis of a; five rows. In two dimensions a ball joint, without an axis.
 
         The angular rows are side.(omega_b - omega_a) for two unit vectors normal to the axis, with the errors
@@ -287,9 +325,16 @@ class RowBuilder:
         return self._add("hinge", a, b, feature, name, anchor, anchor_b, axis, axis_b)
 
     def weld(
-        self, a: int | None, b: int | None, anchor: ArrayLike, anchor_b: ArrayLike | None = None,
-        *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor: ArrayLike,
+        anchor_b: ArrayLike | None = None,
+        *,
+        angle_error: ArrayLike = 0.0,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a weld: b does not move relative to a; six rows, in two dimensions three.
 
         Parameters
@@ -303,9 +348,17 @@ class RowBuilder:
         return self._add("weld", a, b, feature, name, anchor, anchor_b, angle_error)
 
     def slider(
-        self, a: int | None, b: int | None, anchor: ArrayLike, axis: ArrayLike, anchor_b: ArrayLike | None = None,
-        *, angle_error: ArrayLike = 0.0, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor: ArrayLike,
+        axis: ArrayLike,
+        anchor_b: ArrayLike | None = None,
+        *,
+        angle_error: ArrayLike = 0.0,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a slider: b moves along an axis of a without rotating; five rows, in two dimensions two.
 
         Parameters
@@ -323,9 +376,16 @@ class RowBuilder:
         return self._add("slider", a, b, feature, name, anchor, anchor_b, axis, angle_error)
 
     def distance(
-        self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float | None = None,
-        *, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor_a: ArrayLike,
+        anchor_b: ArrayLike,
+        length: float | None = None,
+        *,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a rod: two points keep their distance; one row.
 
         Parameters
@@ -341,9 +401,18 @@ class RowBuilder:
         return self._add("distance", a, b, feature, name, anchor_a, anchor_b, length)
 
     def spring(
-        self, a: int | None, b: int | None, anchor_a: ArrayLike, anchor_b: ArrayLike, length: float,
-        *, stiffness: float, damping: float = 0.0, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        anchor_a: ArrayLike,
+        anchor_b: ArrayLike,
+        length: float,
+        *,
+        stiffness: float,
+        damping: float = 0.0,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a spring with a damper between two points, integrated by implicit Euler (`RowBuilder`, eq. 2); one row.
 
         Parameters
@@ -360,13 +429,23 @@ class RowBuilder:
         damping : float, N s/m, default 0
             c.
         """
-        return self._add("spring", a, b, feature, name, anchor_a, anchor_b, length, stiffness, damping)
+        return self._add(
+            "spring", a, b, feature, name, anchor_a, anchor_b, length, stiffness, damping
+        )
 
     def motor(
-        self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, speed: float,
-        max_torque: float | None = None, max_force: float | None = None, anchor: ArrayLike | None = None,
-        feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        axis: ArrayLike | None = None,
+        *,
+        speed: float,
+        max_torque: float | None = None,
+        max_force: float | None = None,
+        anchor: ArrayLike | None = None,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a motor: it drives to `speed` with a limited torque or force (`RowBuilder`, eq. 3); one row.
 
         Parameters
@@ -389,9 +468,18 @@ class RowBuilder:
         return self._add("motor", a, b, feature, name, axis, anchor, speed, max_torque, max_force)
 
     def limit(
-        self, a: int | None, b: int | None, axis: ArrayLike | None = None, *, value: float, lower: float = -inf,
-        upper: float = inf, anchor: ArrayLike | None = None, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        axis: ArrayLike | None = None,
+        *,
+        value: float,
+        lower: float = -inf,
+        upper: float = inf,
+        anchor: ArrayLike | None = None,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add limits of a joint's angle or travel (`RowBuilder`, eq. 4); one row for each finite limit.
 
         Parameters
@@ -416,9 +504,17 @@ class RowBuilder:
         return self._add("limit", a, b, feature, name, axis, anchor, value, lower, upper)
 
     def gear(
-        self, a: int | None, b: int | None, axis_a: ArrayLike | None = None, axis_b: ArrayLike | None = None,
-        *, ratio: float, angle_error: float = 0.0, feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        axis_a: ArrayLike | None = None,
+        axis_b: ArrayLike | None = None,
+        *,
+        ratio: float,
+        angle_error: float = 0.0,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a gear: axis_a.omega_a + ratio axis_b.omega_b = 0, for bodies on hinges of the static world; one row.
 
         Parameters
@@ -438,10 +534,20 @@ class RowBuilder:
     # -- contacts ------------------------------------------------------------------------------------------------
 
     def contact(
-        self, a: int | None, b: int | None, point: ArrayLike, normal: ArrayLike, *, gap: float = 0.0, mu: float = 0.0,
-        restitution: float = 0.0, restitution_threshold: float = 1.0, tangent: ArrayLike | None = None,
-        feature: int | None = None, name: str = "",
-    ) -> int:  # fmt: skip
+        self,
+        a: int | None,
+        b: int | None,
+        point: ArrayLike,
+        normal: ArrayLike,
+        *,
+        gap: float = 0.0,
+        mu: float = 0.0,
+        restitution: float = 0.0,
+        restitution_threshold: float = 1.0,
+        tangent: ArrayLike | None = None,
+        feature: int | None = None,
+        name: str = "",
+    ) -> int:
         """Add a contact point (`RowBuilder`, eq. 5): a normal row, and with friction two tangent rows, in 2-D one.
 
         Parameters
@@ -475,10 +581,19 @@ class RowBuilder:
     # -- arrays of blocks ----------------------------------------------------------------------------------------
 
     def contacts(
-        self, bodies: ArrayLike, points: ArrayLike, normals: ArrayLike, *, gap: ArrayLike = 0.0, mu: ArrayLike = 0.0,
-        restitution: ArrayLike = 0.0, restitution_threshold: ArrayLike = 1.0, tangents: ArrayLike | None = None,
-        feature: ArrayLike | None = None, names: Sequence[str] | None = None,
-    ) -> np.ndarray:  # fmt: skip
+        self,
+        bodies: ArrayLike,
+        points: ArrayLike,
+        normals: ArrayLike,
+        *,
+        gap: ArrayLike = 0.0,
+        mu: ArrayLike = 0.0,
+        restitution: ArrayLike = 0.0,
+        restitution_threshold: ArrayLike = 1.0,
+        tangents: ArrayLike | None = None,
+        feature: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> np.ndarray:
         """Add n contacts: the same as n calls of `contact`, in less time.
 
         Parameters
@@ -512,9 +627,14 @@ class RowBuilder:
         return self._add_many("contact", bodies, feature, names, values)
 
     def joints(
-        self, block_type: str, bodies: ArrayLike, *, feature: ArrayLike | None = None,
-        names: Sequence[str] | None = None, **arguments: Any,
-    ) -> np.ndarray:  # fmt: skip
+        self,
+        block_type: str,
+        bodies: ArrayLike,
+        *,
+        feature: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        **arguments: Any,
+    ) -> np.ndarray:
         """Add n joints of one type: the same as n calls of the method with this name.
 
         Parameters
@@ -570,12 +690,18 @@ class RowBuilder:
         blocks, rows, b, compliance, keys = self._blocks.export(is_box)
         given = dict(self._names)
         return Problem(
-            b, Cones._from_blocks(blocks),
-            rows=Rows(self._inv_mass, self._inv_inertia, self._velocity, **rows, copy=False), friction=friction,
-            compliance=compliance, key=keys,
-            names=Names(len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]), name=name,
+            b,
+            Cones._from_blocks(blocks),
+            rows=Rows(self._inv_mass, self._inv_inertia, self._velocity, **rows, copy=False),
+            friction=friction,
+            compliance=compliance,
+            key=keys,
+            names=Names(
+                len(keys), lambda: [given.get(key) or name_block(key) for key in keys.tolist()]
+            ),
+            name=name,
             copy=False,
-        )  # fmt: skip
+        )
 
     def rows_of(self, key: int) -> slice:
         """Return the rows of a block in the problem's impulses and slacks, by the key that its method returned.
@@ -593,7 +719,9 @@ class RowBuilder:
         wanted = check_int("key", key, high=2**64 - 1)
         found = self._blocks.find_rows(wanted)
         if found is None:
-            raise InputError(f"key is {wanted}; a key that a method of this builder returned is needed")
+            raise InputError(
+                f"key is {wanted}; a key that a method of this builder returned is needed"
+            )
         return slice(found[0], found[0] + found[1])
 
     def velocity_after(self, problem: Problem, impulse: ArrayLike) -> FloatArray:
@@ -613,7 +741,9 @@ class RowBuilder:
         """
         n = len(self._position)
         if not isinstance(problem, Problem) or problem.rows is None or problem.rows.n_bodies != n:
-            raise InputError(f"problem is {problem!r:.60}; the result of RowBuilder.problem() is needed")
+            raise InputError(
+                f"problem is {problem!r:.60}; the result of RowBuilder.problem() is needed"
+            )
         after = problem.velocity(impulse)
         return np.ascontiguousarray(after[:, PLANAR_VELOCITIES]) if self._is_planar else after
 
@@ -625,7 +755,8 @@ class RowBuilder:
 
     def _check_pair(self, a: int | None, b: int | None) -> tuple[int, int]:
         """Return the numbers of two different bodies, at most one of them the static world (-1)."""
-        found, n = [], len(self._position)
+        found = []
+        n = len(self._position)
         for name, body in (("a", a), ("b", b)):
             try:
                 found.append(-1 if body is None else check_int(name, body, -1, n - 1))
@@ -636,7 +767,9 @@ class RowBuilder:
                 ) from None
         if found[0] == found[1]:
             same = "the static world" if found[0] < 0 else f"body {found[0]}"
-            raise InputError(f"a and b are both {same}; two bodies are needed, at most one of them static")
+            raise InputError(
+                f"a and b are both {same}; two bodies are needed, at most one of them static"
+            )
         return found[0], found[1]
 
     def _convert_values(self, block_type: str, values: Iterable[Any]) -> tuple[Any, ...]:
@@ -651,11 +784,18 @@ class RowBuilder:
             elif argument in ROTATION_AXES and self._is_planar and get_shape(name, value) != (2,):
                 raise InputError(MESSAGES["axis_given"].format(argument=name, given=value))
             elif is_vector:
-                if width == self._dimensions and name != "angle_error" and get_shape(name, value) == ():
+                if (
+                    width == self._dimensions
+                    and name != "angle_error"
+                    and get_shape(name, value) == ()
+                ):
                     raise InputError(f"{name} is {value!r:.60}; a vector ({width},) is needed")
                 unit = "m" if name.startswith(("anchor", "point")) else ""
                 converted.append(as_array(name, value, (width,), unit=unit).tolist())
-            elif isinstance(value, (float, np.floating)) and value == {"lower": -inf, "upper": inf}.get(name):
+            elif isinstance(value, (float, np.floating)) and value == {
+                "lower": -inf,
+                "upper": inf,
+            }.get(name):
                 converted.append(float(value))
             else:
                 converted.append(check_float(name, value, **RANGES.get(name, {})))
@@ -670,8 +810,13 @@ class RowBuilder:
 
     def _describe_fault(self, block_type: str, values: Sequence[Any]) -> str:
         """Return the message of the last fault of `_blocks`; `values` are the converted arguments of the block."""
-        x, i = dict(zip(NAMES[block_type], values, strict=True)), self._blocks.argument
-        more = {"argument": NAMES[block_type][i], "given": values[i], "dimensions": self._dimensions}
+        x = dict(zip(NAMES[block_type], values, strict=True))
+        i = self._blocks.argument
+        more = {
+            "argument": NAMES[block_type][i],
+            "given": values[i],
+            "dimensions": self._dimensions,
+        }
         if isinstance(values[i], list):
             more["size"] = hypot(*values[i])
         if block_type == "distance":
@@ -684,7 +829,9 @@ class RowBuilder:
         if feature is None:
             number: int = self._blocks.next_feature.get(key, 0)
             if number > MAX_FEATURE:
-                raise InputError(f"feature is None; after {number} blocks of a pair of bodies, one is needed")
+                raise InputError(
+                    f"feature is None; after {number} blocks of a pair of bodies, one is needed"
+                )
         else:
             number = check_int("feature", feature, high=MAX_FEATURE)
         if key | number in self._blocks.keys:
@@ -698,7 +845,13 @@ class RowBuilder:
     # -- blocks --------------------------------------------------------------------------------------------------
 
     def _add(
-        self, block_type: str, a: int | None, b: int | None, feature: int | None, name: str, *values: Any
+        self,
+        block_type: str,
+        a: int | None,
+        b: int | None,
+        feature: int | None,
+        name: str,
+        *values: Any,
     ) -> int:
         """Add a block and return its key; `values` are its ARGUMENTS."""
         if not isinstance(name, str):
@@ -707,7 +860,9 @@ class RowBuilder:
         key: int | None = self._blocks.add(number, a, b, feature, values)
         if key is None:  # An argument is invalid, or needs a conversion.
             pair, values = self._check_pair(a, b), self._convert_values(block_type, values)
-            key = self._blocks.add(number, *pair, self._check_feature(block_type, pair, feature), values)
+            key = self._blocks.add(
+                number, *pair, self._check_feature(block_type, pair, feature), values
+            )
             if key is None:
                 raise InputError(self._describe_fault(block_type, values))
         if name:
@@ -715,7 +870,12 @@ class RowBuilder:
         return key
 
     def _add_many(
-        self, block_type: str, bodies: ArrayLike, feature: ArrayLike | None, names: Any, values: Iterable[Any]
+        self,
+        block_type: str,
+        bodies: ArrayLike,
+        feature: ArrayLike | None,
+        names: Any,
+        values: Iterable[Any],
     ) -> np.ndarray:
         """Add n blocks and return their keys (n,); `values` are arrays of their ARGUMENTS."""
         pairs = as_array("bodies", bodies, (None, 2), dtype=np.int32)
@@ -727,7 +887,9 @@ class RowBuilder:
             for k, value in enumerate(values)
         ]
         keys = np.empty(n, np.uint64)
-        i = self._blocks.add_many(BLOCK_TYPES.index(block_type), pairs, numbers, tuple(arrays), keys)
+        i = self._blocks.add_many(
+            BLOCK_TYPES.index(block_type), pairs, numbers, tuple(arrays), keys
+        )
         if i >= 0:
             try:
                 pair = self._check_pair(*pairs[i].tolist())
@@ -750,13 +912,16 @@ class RowBuilder:
 
     def _as_values(self, block_type: str, k: int, value: ArrayLike, n: int) -> FloatArray:
         """Convert argument k of n blocks to an array; one vector or number is repeated."""
-        name, (is_vector, width) = NAMES[block_type][k], self._get_width(block_type, k)
+        name = NAMES[block_type][k]
+        (is_vector, width) = self._get_width(block_type, k)
         if not is_vector:
             array = as_array(name, value, (n,), finite=name not in ("lower", "upper"))
             return array if width == self._dimensions else np.outer(array, (0.0, 0.0, 1.0))
         shape = get_shape(name, value)
         if shape == () and name != "angle_error":
-            raise InputError(f"{name} is {value!r:.60}; vectors ({n}, {width}) are needed, or one vector")
+            raise InputError(
+                f"{name} is {value!r:.60}; vectors ({n}, {width}) are needed, or one vector"
+            )
         if shape in ((), (width,)):
             return np.tile(as_array(name, value, (width,)), (n, 1))
         return as_array(name, value, (n, width))

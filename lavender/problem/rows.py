@@ -29,9 +29,15 @@ MAX_UNCORRECTED_ERROR = 1e-9
 # [-] Larger errors of unit vectors and inertias are rejected; float32 with several rotations causes less.
 MAX_CORRECTED_ERROR = 1e-5
 UNITS = {
-    "inv_mass": "1/kg", "inv_inertia": "1/(kg m^2)", "v_free": "m/s, rad/s", "jac": "-", "normal": "-", "tangent": "-",
-    "arm_a": "m", "arm_b": "m",
-}  # fmt: skip
+    "inv_mass": "1/kg",
+    "inv_inertia": "1/(kg m^2)",
+    "v_free": "m/s, rad/s",
+    "jac": "-",
+    "normal": "-",
+    "tangent": "-",
+    "arm_a": "m",
+    "arm_b": "m",
+}
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -128,15 +134,28 @@ class Rows:
     precision = "float64"
 
     def __init__(
-        self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = (),
-        joint_ptr: ArrayLike = (0,), joint_body: ArrayLike = (), normal: ArrayLike = (), tangent: ArrayLike = (),
-        arm_a: ArrayLike = (), arm_b: ArrayLike = (), contact_body: ArrayLike = (), copy: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        inv_mass: ArrayLike,
+        inv_inertia: ArrayLike,
+        v_free: ArrayLike,
+        jac: ArrayLike = (),
+        joint_ptr: ArrayLike = (0,),
+        joint_body: ArrayLike = (),
+        normal: ArrayLike = (),
+        tangent: ArrayLike = (),
+        arm_a: ArrayLike = (),
+        arm_b: ArrayLike = (),
+        contact_body: ArrayLike = (),
+        copy: bool = True,
+    ) -> None:
         masses, normals = get_shape("inv_mass", inv_mass), get_shape("normal", normal)
-        n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
+        n = masses[0] if len(masses) == 1 else None
+        c = normals[0] if normals else None
         ptr = as_array("joint_ptr", joint_ptr, (None,), dtype=np.int32, copy=copy)
         if not checks.are_pointers_valid(ptr, 1):
-            raise InputError(f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase")
+            raise InputError(
+                f"joint_ptr is {ptr.tolist()!s:.60}; it must start with 0 and increase"
+            )
         rows, joints = get_shape("jac", jac), get_shape("joint_body", joint_body)
         are_tables = all(len(shape) == 2 or shape == (0,) for shape in (rows, joints))
         if are_tables and (rows[0], joints[0]) != (ptr[-1], len(ptr) - 1):
@@ -145,18 +164,29 @@ class Rows:
                 f"{ptr.tolist()!s:.60}, default [0]; the first row of each joint, then the number of rows is needed"
             )
         numbers: dict[str, tuple[Any, tuple[int | None, ...]]] = {
-            "inv_mass": (inv_mass, (n,)), "inv_inertia": (inv_inertia, (n, 3, 3)), "v_free": (v_free, (n, 6)),
-            "jac": (jac, (int(ptr[-1]), 12)), "normal": (normal, (c, 3)), "tangent": (tangent, (c, 3)),
-            "arm_a": (arm_a, (c, 3)), "arm_b": (arm_b, (c, 3)),
-        }  # fmt: skip
+            "inv_mass": (inv_mass, (n,)),
+            "inv_inertia": (inv_inertia, (n, 3, 3)),
+            "v_free": (v_free, (n, 6)),
+            "jac": (jac, (int(ptr[-1]), 12)),
+            "normal": (normal, (c, 3)),
+            "tangent": (tangent, (c, 3)),
+            "arm_a": (arm_a, (c, 3)),
+            "arm_b": (arm_b, (c, 3)),
+        }
         values: dict[str, Any] = {
             name: as_array(name, value, shape, copy=copy, unit=UNITS[name])
             for name, (value, shape) in numbers.items()
         }
-        if get_common_precision(*(numbers[name][0] for name, x in values.items() if x.size)) == "float32":
+        if (
+            get_common_precision(*(numbers[name][0] for name, x in values.items() if x.size))
+            == "float32"
+        ):
             values["precision"] = "float32"
         values["joint_ptr"] = ptr
-        for name, body, k in (("joint_body", joint_body, len(ptr) - 1), ("contact_body", contact_body, c)):
+        for name, body, k in (
+            ("joint_body", joint_body, len(ptr) - 1),
+            ("contact_body", contact_body, c),
+        ):
             values[name] = as_array(name, body, (k, 2), dtype=np.int32, copy=copy)
         # `copy=False` applies to this call only, not to later `replace` calls.
         self.__dict__.update(values, copy=True)
@@ -176,7 +206,8 @@ class Rows:
         """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""
         name, _, kind = fault.rpartition("_")
         if kind == "body":
-            name, n = fault, len(self.inv_mass)
+            name = fault
+            n = len(self.inv_mass)
             body = getattr(self, name).reshape(-1)[index]
             raise InputError(f"{name} names body {body}; there are {n} bodies, and -1 is static")
         if kind == "pair":
@@ -185,7 +216,9 @@ class Rows:
                 raise InputError(
                     f"{name}_body[{index}] is [{body}, {body}]; two different bodies are needed, or -1 for a static one"
                 )
-            raise InputError(f"{name}_body[{index}] is [-1, -1], two static bodies; a moving one is needed")
+            raise InputError(
+                f"{name}_body[{index}] is [-1, -1], two static bodies; a moving one is needed"
+            )
         check_nonnegative_magnitudes("inv_mass", self.inv_mass, UNITS["inv_mass"])
         largest = np.abs(self.inv_inertia).max(axis=(1, 2), initial=0.0)
         check_nonnegative_magnitudes("largest entry of inv_inertia", largest, UNITS["inv_inertia"])
@@ -257,21 +290,32 @@ class Rows:
         t2 = np.cross(self.normal, self.tangent)
         for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
             contacts = np.flatnonzero(tangents >= row)
-            with np.errstate(over="ignore", invalid="ignore"):  # Products with very large arms may overflow.
+            with np.errstate(
+                over="ignore", invalid="ignore"
+            ):  # Products with very large arms may overflow.
                 angular_a = np.cross(self.arm_a[contacts], axis[contacts])
                 angular_b = np.cross(self.arm_b[contacts], axis[contacts])
-            dense[first[contacts] + row] = np.hstack([-axis[contacts], -angular_a, axis[contacts], angular_b])
+            dense[first[contacts] + row] = np.hstack(
+                [-axis[contacts], -angular_a, axis[contacts], angular_b]
+            )
         # Fill spin and rolling rows.
         spin, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
-        for axis, rows in ((self.normal, spin), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
+        for axis, rows in (
+            (self.normal, spin),
+            (self.tangent, rolling),
+            (t2, rolling + (rolling >= 0)),
+        ):
             contacts = np.flatnonzero(rows >= 0)
             dense[rows[contacts]] = 0.0
-            dense[rows[contacts], 3:6], dense[rows[contacts], 9:12] = -axis[contacts], axis[contacts]
+            dense[rows[contacts], 3:6] = -axis[contacts]
+            dense[rows[contacts], 9:12] = axis[contacts]
         # Keep the nonzero entries in columns of moving bodies.
         is_stored = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
         indptr = np.concatenate([[0], np.cumsum(is_stored.sum(axis=1))])
-        jac = sp.csr_array((dense[is_stored], columns[is_stored], indptr), shape=(m, 6 * self.n_bodies))
+        jac = sp.csr_array(
+            (dense[is_stored], columns[is_stored], indptr), shape=(m, 6 * self.n_bodies)
+        )
         jac.sort_indices()
         return jac
 
@@ -295,7 +339,9 @@ class Rows:
         if not isinstance(other, Rows):
             return NotImplemented
         return all(
-            are_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+            are_equal(getattr(self, f.name), getattr(other, f.name))
+            for f in fields(self)
+            if f.name != "copy"
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -325,7 +371,9 @@ def check_and_symmetrise_inertia(name: str, tensors: FloatArray) -> FloatArray:
     if not is_corrected.any():
         return tensors
     value, axes = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
-    new = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
+    new = size[:, None, None] * (
+        (axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
+    )
     return mark_read_only(
         np.where(is_corrected[:, None, None], 0.5 * (new + new.transpose(0, 2, 1)), tensors)
     )

@@ -140,19 +140,27 @@ def solve_qp(
     problem = None
     if isinstance(P, Problem):
         if isinstance(q, str):
-            solver, q = q, None
-        problem, qp = P, P.qp
+            solver = q
+            q = None
+        problem = P
+        qp = P.qp
         if qp is None:
-            raise InputError("the problem contains no quadratic program; one of Problem.from_qp is needed")
+            raise InputError(
+                "the problem contains no quadratic program; one of Problem.from_qp is needed"
+            )
         if any(x is not None for x in (G, A, lb, ub)):
-            raise InputError("G, A, lb or ub is given with a problem; only q, h and b of it can be replaced")
+            raise InputError(
+                "G, A, lb or ub is given with a problem; only q, h and b of it can be replaced"
+            )
         if not (q is None and h is None and b is None):
             qp = qp.with_vectors(q, h, b)
             problem = Problem(**(qp.problem_fields() | {"qp": qp, "name": P.name, "copy": False}))
     else:
         if P is None:
             if q is None:
-                raise InputError("P and q are missing; q is needed, and P unless the program is linear")
+                raise InputError(
+                    "P and q are missing; q is needed, and P unless the program is linear"
+                )
             P = sp.csr_array((np.size(q), np.size(q)))
         qp = make_quadratic_program((P, q, G, h, A, b, lb, ub))
     tol = check_float("tol", tol, low=0.0)
@@ -233,7 +241,8 @@ class _Task:
             if self.proof is None and self.qp.is_singular:
                 found = find_ray(self.program, self.judge.x, self.deadline)
                 if found is not None:
-                    self.ray, self.judge.x = mark_read_only(found[0]), found[1]
+                    self.ray = mark_read_only(found[0])
+                    self.judge.x = found[1]
                     self.judge.lam = np.zeros(len(self.qp.target))
         return self._make_answer(begun)
 
@@ -257,10 +266,14 @@ class _Task:
     def _judge_start(self) -> None:
         """Judge the start: if it meets tol, nothing runs."""
         assert self.start is not None
-        self.judge.keep(self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start))
-        status, message = STALLED, "no better point than the start was found"
+        self.judge.keep(
+            self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start)
+        )
+        status = STALLED
+        message = "no better point than the start was found"
         if self.judge.error <= self.tol:
-            status, message = CONVERGED, "the start is a solution"
+            status = CONVERGED
+            message = "the start is a solution"
         self.runs.append(Run("start", status, message, {}, self.judge.error))
 
     def _call_backend(self, spec: SolverSpec, options: dict[str, Any]) -> None:
@@ -269,11 +282,16 @@ class _Task:
         assert isinstance(solver, QPSolver)
         start = None
         if self.start is not None and solver.backend.starts:
-            start = self.qp.recover_variables(self.start), self.qp.select_row_multipliers(self.start)
+            start = (
+                self.qp.recover_variables(self.start),
+                self.qp.select_row_multipliers(self.start),
+            )
             start = start if np.isfinite(start[0]).all() else None
         elif self.initial_x is not None and solver.backend.starts:
             start = self.initial_x, np.zeros(len(self.qp.target))
-        judge, result = solver.solve_program(self.qp, self.judge.tol, self.max_iter, self.deadline, start)
+        judge, result = solver.solve_program(
+            self.qp, self.judge.tol, self.max_iter, self.deadline, start
+        )
         if judge.error < self.judge.error or self.judge.x is None:
             self.judge = judge
         if result.status is INFEASIBLE and result.point is not None:
@@ -285,13 +303,15 @@ class _Task:
         inner, start = self.tol, self.start
         for _ in range(MAX_SOLVES):
             solution = self._run_solve(inner, start)
-            goal, error = self.tol, self.judge.error
+            goal = self.tol
+            error = self.judge.error
             if error <= goal or solution.status is not CONVERGED or self.deadline.has_passed():
                 break
             smaller = max(TOL_RATIO * inner * goal / error, 1e-15)
             if not smaller < inner:
                 break
-            inner, start = smaller, solution.impulse
+            inner = smaller
+            start = solution.impulse
 
     def _run_solve(self, tol: float, start: Any) -> Solution:
         """Solve the constraint problem once, and keep its point if it is the best."""
@@ -309,7 +329,9 @@ class _Task:
         if solution.certificate is not None and solution.status is INFEASIBLE:
             self.proof = Proof(solution.certificate, solution.impulse_bound or math.inf)
         self.solution = solution
-        run = Run(self.spec.name, solution.status, solution.message, dict(solution.work), self.judge.error)
+        run = Run(
+            self.spec.name, solution.status, solution.message, dict(solution.work), self.judge.error
+        )
         self.runs.append(run._replace(form=solution.solver.form))
         return solution
 
@@ -321,7 +343,8 @@ class _Task:
         impulse = mark_read_only(np.concatenate([x, lam]) if qp.is_singular else np.array(lam))
         y, z, box = qp.multipliers(impulse)
         last = min(self.runs, key=lambda run: run.error) if len(self.runs) > 1 else self.runs[-1]
-        status, conflict = last.status, ""
+        status = last.status
+        conflict = ""
         is_found = judge.error <= self.tol and self.proof is None and self.ray is None
         if is_found:
             status = CONVERGED
@@ -336,27 +359,39 @@ class _Task:
             if self.solution is not None and self.solution.is_contradicted:
                 conflict = self.solution.status_conflict
             elif is_false and self.spec.external:
-                conflict = (
-                    f"says CONVERGED, the program's error {judge.error:.1e} is above tol {self.tol:.1e}"
-                )
+                conflict = f"says CONVERGED, the program's error {judge.error:.1e} is above tol {self.tol:.1e}"
             status = STALLED
-        solution = Solution.from_fields({
-            "impulse": impulse, "status": status, "tol": self.tol, "setup_time": 0.0,
-            "solve_time": perf_counter() - begun, "program_error": judge.error,
-            "_rest": (self._compute_late_fields, (impulse, last, conflict, is_found)),
-        })  # fmt: skip
+        solution = Solution.from_fields(
+            {
+                "impulse": impulse,
+                "status": status,
+                "tol": self.tol,
+                "setup_time": 0.0,
+                "solve_time": perf_counter() - begun,
+                "program_error": judge.error,
+                "_rest": (self._compute_late_fields, (impulse, last, conflict, is_found)),
+            }
+        )
         if conflict:
             solution = solution.with_fields(claim_check=CONTRADICTED)
         return QPSolution(
-            x=mark_read_only(x), y=y, z=z, z_box=box, solution=solution, ray=self.ray, impulse=impulse, qp=qp,
+            x=mark_read_only(x),
+            y=y,
+            z=z,
+            z_box=box,
+            solution=solution,
+            ray=self.ray,
+            impulse=impulse,
+            qp=qp,
             tol=self.tol,
-        )  # fmt: skip
+        )
 
     def _compute_late_fields(
         self, impulse: FloatArray, last: Run, conflict: str, is_found: bool
     ) -> dict[str, Any]:
         """Return the fields of the solution that are computed when one is first read."""
-        qp, judged = self.qp, residual(self.problem, impulse, "float64")
+        qp = self.qp
+        judged = residual(self.problem, impulse, "float64")
         work = sum_work_counts(run.work for run in self.runs)
         message = last.message
         if self.proof is not None:
@@ -381,14 +416,21 @@ class _Task:
         proof = self.proof
         return {
             "residual": judged,
-            "iterations": work.get("iterations", 0 if self.solution is None else self.solution.iterations),
-            "work": MappingProxyType(work), "solver": SolverRun(self.spec.name, self.options, last.form),
-            "message": message, "history": None if self.solution is None else self.solution.history, "dual": None,
+            "iterations": work.get(
+                "iterations", 0 if self.solution is None else self.solution.iterations
+            ),
+            "work": MappingProxyType(work),
+            "solver": SolverRun(self.spec.name, self.options, last.form),
+            "message": message,
+            "history": None if self.solution is None else self.solution.history,
+            "dual": None,
             "certificate": None if proof is None else proof.y,
             "impulse_bound": None if proof is None else proof.impulse_bound,
-            "claim_check": CONTRADICTED if conflict else CONFIRMED, "status_conflict": conflict,
-            "sweeps_per_decade": math.nan, "stages": stages,
-        }  # fmt: skip
+            "claim_check": CONTRADICTED if conflict else CONFIRMED,
+            "status_conflict": conflict,
+            "sweeps_per_decade": math.nan,
+            "stages": stages,
+        }
 
 
 def _is_program_backend(spec: SolverSpec, options: dict[str, Any]) -> bool:

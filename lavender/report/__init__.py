@@ -31,10 +31,23 @@ _PUBLIC_NAMES = {
 _MODULE_OF_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 
 __all__ = [
-    "CampaignPlan", "Event", "Item", "Plan", "Report", "Store",
-    "carry_impulses", "classify_structure", "make_sequence", "read", "resolve_sources", "run", "select_runs",
-    "select_solver_names", "tables", "write",
-]  # fmt: skip
+    "CampaignPlan",
+    "Event",
+    "Item",
+    "Plan",
+    "Report",
+    "Store",
+    "carry_impulses",
+    "classify_structure",
+    "make_sequence",
+    "read",
+    "resolve_sources",
+    "run",
+    "select_runs",
+    "select_solver_names",
+    "tables",
+    "write",
+]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 

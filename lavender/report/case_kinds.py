@@ -26,7 +26,10 @@ from lavender.report.structure import classify_structure_and_count_islands, comp
 from lavender.report.text import format_residual
 from lavender.solving.solve import solve
 
-MIN_SPARSE_SIZE, MAX_SPARSE_FILL = 20, 0.2  # P and the rows of a program are "sparse" with at most this fill.
+MIN_SPARSE_SIZE, MAX_SPARSE_FILL = (
+    20,
+    0.2,
+)  # P and the rows of a program are "sparse" with at most this fill.
 ENERGY_ROUNDING = 2.0**-48  # Rounding of a sum of products, divided by the sum of their sizes.
 ROUNDING = 2.0**-50  # [-] Rounding error of a sum, relative to the sum of its absolute terms.
 
@@ -37,9 +40,14 @@ class ContactCase:
     call = "solve"  # Function of lavender that is timed.
     #: Columns of a cross-check with their heads.
     heads: Mapping[str, str] = {
-        "relative": "relative [-]", "roundoff_floor": "floor [-]", "velocity": "error [m/s]",
-        "distance": "distance [√J]", "allowed": "allowed [√J]", "objective": "objective [J]", "time": "time [s]",
-    }  # fmt: skip
+        "relative": "relative [-]",
+        "roundoff_floor": "floor [-]",
+        "velocity": "error [m/s]",
+        "distance": "distance [√J]",
+        "allowed": "allowed [√J]",
+        "objective": "objective [J]",
+        "time": "time [s]",
+    }
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -73,10 +81,15 @@ class ContactCase:
                 rounding = float(np.abs(impulse) @ (np.abs(r.slack) + 2.0 * np.abs(problem.b)))
                 gain = gain if gain > ENERGY_ROUNDING * rounding else 0.0
         return {
-            "relative": float(r.relative), "error_energy": float(r.energy), "velocity": float(r.velocity),
-            "roundoff_floor": float(r.roundoff_floor), "worst_row": int(r.worst_row), "worst_name": r.worst_label,
-            "energy_change": change, "energy_gain": gain,
-        }  # fmt: skip
+            "relative": float(r.relative),
+            "error_energy": float(r.energy),
+            "velocity": float(r.velocity),
+            "roundoff_floor": float(r.roundoff_floor),
+            "worst_row": int(r.worst_row),
+            "worst_name": r.worst_label,
+            "energy_change": change,
+            "energy_gain": gain,
+        }
 
     def judge_impulse(self, impulse: FloatArray) -> float:
         """Return the relative error of an impulse (m,) [N s]."""
@@ -87,10 +100,16 @@ class ContactCase:
         p = self.problem
         structure, islands = classify_structure_and_count_islands(p)
         return {
-            "law": p.law, "rows": p.m, "blocks": p.n_blocks, "islands": islands, "contacts": count_contacts(p),
-            "mass_ratio": compute_mass_ratio(p), "structure": ", ".join(structure), "symmetric": bool(p.is_symmetric),
+            "law": p.law,
+            "rows": p.m,
+            "blocks": p.n_blocks,
+            "islands": islands,
+            "contacts": count_contacts(p),
+            "mass_ratio": compute_mass_ratio(p),
+            "structure": ", ".join(structure),
+            "symmetric": bool(p.is_symmetric),
             "nothing_to_do": bool(is_solved_by_zero(p)),
-        }  # fmt: skip
+        }
 
     def list_diagnostics(self) -> list[str]:
         """Return possible mistakes in the problem's data."""
@@ -100,13 +119,31 @@ class ContactCase:
         """Return the arrays that determine the problem; the v* of bodies is part of b."""
         problem = self.problem
         c, r, g = problem.cones, problem.rows, problem.generalized
-        arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
+        arrays: list[Any] = [
+            problem.b,
+            problem.guess,
+            c.ptr,
+            c.kind,
+            c.lower,
+            c.upper,
+            c.mu,
+            c.patch_radius,
+        ]
         arrays += [c.rolling] if c.has_rolling else []
         if r is None:
             for a in (problem.csr,) if g is None else (g.jac, g.mass):
                 arrays += [a.indptr, a.indices, a.data]
             return arrays + ([] if g is None else [g.v_free, problem.compliance])
-        arrays += [r.jac, r.joint_body, r.normal, r.tangent, r.arm_a, r.arm_b, r.contact_body, r.inv_mass]
+        arrays += [
+            r.jac,
+            r.joint_body,
+            r.normal,
+            r.tangent,
+            r.arm_a,
+            r.arm_b,
+            r.contact_body,
+            r.inv_mass,
+        ]
         return [*arrays, r.inv_inertia, problem.compliance]
 
     def explain_no_reference(self) -> str:
@@ -115,7 +152,9 @@ class ContactCase:
         if not p.is_symmetric:
             return f"A is not symmetric (by {format_residual(p.asymmetry)}), so the problem is not a QP"
         if not p.is_semidefinite:
-            return "A is not positive semidefinite: several solutions with different motions may exist"
+            return (
+                "A is not positive semidefinite: several solutions with different motions may exist"
+            )
         return ""
 
     def compute_objective(self, solution: Solution) -> float:
@@ -134,21 +173,27 @@ class ContactCase:
         # The errors e are known up to the round-off floors of both residuals, in the norm of D.
         uncertainty = float(sum(s.residual.floor_energy for s in (one, two)))
         root = 1.0 / np.sqrt(d)
-        max_stiffness = float(np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0)))
+        max_stiffness = float(
+            np.sqrt(np.max(root * _multiply_by_a(problem, root, abs), initial=0.0))
+        )
         eps_d = float(np.sqrt(np.sum(d * eps * eps))) + uncertainty
         eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + max_stiffness * uncertainty
         delta_d = float(np.sqrt(np.sum(d * delta * delta)))
         # x^2 <= x eps_a + eps_d delta_d bounds x = |Delta|_A by the larger root. `rounding`: of Delta.A Delta.
         rounding = ROUNDING * max_stiffness * delta_d
         allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
-        return delta_norm, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d))
+        return delta_norm, float(
+            allowed * (1.0 + 1e-9) + np.sqrt(rounding * max_stiffness * delta_d)
+        )
 
     def describe_zero(self, solution: Solution) -> str:
         """Return the errors of an answer to a problem that the zero impulse solves; empty for other problems."""
         r = solution.residual
         if not r.nothing_to_do or r.verdict == WRONG:
             return ""
-        return f"{format_residual(r.velocity)} {r.velocity_unit}, {format_residual(r.energy)} sqrt(J)"
+        return (
+            f"{format_residual(r.velocity)} {r.velocity_unit}, {format_residual(r.energy)} sqrt(J)"
+        )
 
     def is_solved(self, solution: Solution) -> bool:
         """Return whether an answer meets its tolerance, or rounding prevents a better one."""
@@ -160,9 +205,12 @@ class ProgramCase(ContactCase):
 
     call = "solve_qp"
     heads: Mapping[str, str] = {
-        "relative": "error [-]", "distance": "distance [√cost]", "allowed": "allowed [√cost]",
-        "objective": "objective [cost]", "time": "time [s]",
-    }  # fmt: skip
+        "relative": "error [-]",
+        "distance": "distance [√cost]",
+        "allowed": "allowed [√cost]",
+        "objective": "objective [cost]",
+        "time": "time [s]",
+    }
 
     def copy(self, start: str = "") -> ProgramCase:
         """Build the program again from its arrays; it has no guess."""
@@ -178,7 +226,12 @@ class ProgramCase(ContactCase):
         error = solution.program_error
         if error is None:  # from `solve`, which judges the program as a contact problem
             error = self.judge_impulse(solution.impulse)
-        return {"relative": error, "error_energy": math.nan, "velocity": math.nan, "roundoff_floor": 0.0}
+        return {
+            "relative": error,
+            "error_energy": math.nan,
+            "velocity": math.nan,
+            "roundoff_floor": 0.0,
+        }
 
     def judge_impulse(self, impulse: FloatArray) -> float:
         """Return the error of the x and the multipliers that belong to an impulse (m,)."""
@@ -191,9 +244,16 @@ class ProgramCase(ContactCase):
         n, m = len(p_ptr) - 1, len(j_ptr) - 1
         kind = "linear program" if not p.any() else "singular P" if qp.is_singular else "definite P"
         general = np.flatnonzero(qp.variable < 0)
-        entries, size = len(p) + len(j) - (m - len(general)), n * (n + len(general))
+        entries = len(p) + len(j) - (m - len(general))
+        size = n * (n + len(general))
         fill = "sparse" if n >= MIN_SPARSE_SIZE and entries <= MAX_SPARSE_FILL * size else "dense"
-        return {"law": "program", "rows": m, "variables": n, "blocks": m, "structure": f"{kind}, {fill}"}
+        return {
+            "law": "program",
+            "rows": m,
+            "variables": n,
+            "blocks": m,
+            "structure": f"{kind}, {fill}",
+        }
 
     def list_diagnostics(self) -> list[str]:
         """Return an empty list."""
@@ -216,19 +276,21 @@ class ProgramCase(ContactCase):
         """Return sqrt(Delta.P Delta) of two answers and the largest value that `report.check` (2) allows."""
         qp = self.problem.qp
         n = len(qp.q)
-        P, J = (sp.csr_array((x[2], x[1], x[0]), (len(x[0]) - 1, n)) for x in (qp.hessian, qp.jacobian))
+        P, J = (
+            sp.csr_array((x[2], x[1], x[0]), (len(x[0]) - 1, n)) for x in (qp.hessian, qp.jacobian)
+        )
         points = (_measure_point(qp, P, J, solution.impulse) for solution in (one, two))
         (x, lam, r, s, broken, r_terms, s_terms), other = points
         delta = x - other[0]
         square = float(delta @ (P @ delta))
         allowed = (
-            np.abs(lam) @ (np.abs(s) + other[4]) + np.abs(other[1]) @ (np.abs(other[3]) + broken)
+            np.abs(lam) @ (np.abs(s) + other[4])
+            + np.abs(other[1]) @ (np.abs(other[3]) + broken)
             + np.abs(delta) @ np.abs(r - other[2])
-        )  # fmt: skip
-        terms = (
-            np.abs(delta) @ (abs(P) @ np.abs(delta) + r_terms + other[5])
-            + (np.abs(lam) + np.abs(other[1])) @ (s_terms + other[6])
-        )  # fmt: skip
+        )
+        terms = np.abs(delta) @ (abs(P) @ np.abs(delta) + r_terms + other[5]) + (
+            np.abs(lam) + np.abs(other[1])
+        ) @ (s_terms + other[6])
         return math.sqrt(max(square, 0.0)), math.sqrt((1.0 + 1e-9) * allowed + ROUNDING * terms)
 
     def describe_zero(self, solution: Solution) -> str:
@@ -248,7 +310,8 @@ def make_case(problem: Problem) -> ContactCase:
 def _measure_point(qp: Any, P: Any, J: Any, impulse: FloatArray) -> tuple[Any, ...]:
     """Return x, multipliers, residuals of columns and rows, violations of rows, and the terms of both residuals."""
     x, lam = qp.recover_variables(impulse), qp.select_row_multipliers(impulse)
-    r, s = P @ x + qp.q - J.T @ lam, J @ x - qp.target
+    r = P @ x + qp.q - J.T @ lam
+    s = J @ x - qp.target
     violated = np.maximum(-s, 0.0)
     violated[: qp.free] = np.abs(s[: qp.free])
     r_terms = abs(P) @ np.abs(x) + np.abs(qp.q) + abs(J).T @ np.abs(lam)
@@ -267,4 +330,6 @@ def _multiply_by_a(problem: Problem, x: Any, transform: Callable[[Any], Any] = l
         return transform(problem.csr) @ x
     assert problem.compliance is not None
     jac = transform(problem.jacobian)
-    return jac @ (transform(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
+    return (
+        jac @ (transform(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
+    )

@@ -42,7 +42,9 @@ class Item:
     name: str
     source: str  # Path, or name in the suite.
     load: Callable[[], Problem]
-    sequence: str = ""  # Name of the sequence that contains the case as a step; empty for a single case.
+    sequence: str = (
+        ""  # Name of the sequence that contains the case as a step; empty for a single case.
+    )
     step: int = -1  # Number of the step; -1 for a single case.
     in_memory: Problem | None = None  # The problem itself, if it was passed as an object.
     # Returns the answer stored with the problem (m,) [N s], or None.
@@ -76,13 +78,20 @@ def is_path(word: Source) -> bool:
     """Return whether `word` names a file or folder, which need not exist, and not a case of the suite."""
     if not isinstance(word, str):
         return isinstance(word, Path)
-    return "/" in word or os.sep in word or Path(word).suffix.lower() in SUFFIXES or Path(word).exists()
+    return (
+        "/" in word
+        or os.sep in word
+        or Path(word).suffix.lower() in SUFFIXES
+        or Path(word).exists()
+    )
 
 
 Source = str | Path | Problem | Case | Item
 
 
-def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
+def resolve_sources(
+    sources: Source | Iterable[Source], sequences: bool | None = None
+) -> list[Item]:
     """Resolve files, folders (and folders in them), names and cases of the suite to items; the default suite if none.
 
     No problem is solved and usually none is loaded, but every source is checked to exist.
@@ -106,11 +115,17 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
     if isinstance(sources, Source):
         sources = [sources]
     sources = check_sequence("cases", sources, "files, folders, names or problems")
-    items = [] if sources else [_make_item_of_problem(case.problem, case.name) for case in suite.default()]
+    items = (
+        []
+        if sources
+        else [_make_item_of_problem(case.problem, case.name) for case in suite.default()]
+    )
     visited: set[Path] = set()  # Folders that were searched: a link may lead back to one of them.
     for source in sources:  # Inner folders are added at the end.
         if isinstance(source, Problem):
-            items.append(_make_item_of_problem(source, source.name or f"problem {len(items)}", source))
+            items.append(
+                _make_item_of_problem(source, source.name or f"problem {len(items)}", source)
+            )
         elif isinstance(source, Item):
             items.append(source)
         elif isinstance(source, Case):
@@ -125,7 +140,8 @@ def resolve_sources(sources: Source | Iterable[Source], sequences: bool | None =
         elif sequences or (sequences is None and _holds_recorded_steps(Path(source))):
             items += _list_recorded_steps(Path(source), items)
         elif (path := Path(source)).is_dir():
-            files, folders = _list_problem_files(path), sorted(p for p in path.iterdir() if p.is_dir())
+            files = _list_problem_files(path)
+            folders = sorted(p for p in path.iterdir() if p.is_dir())
             visited.add(path.resolve())
             folders = [p for p in folders if p.resolve() not in visited and os.access(p, os.R_OK)]
             inner = [p for p in folders if not _is_states_folder(p) and _list_problem_files(p)]
@@ -173,20 +189,27 @@ def list_steps_in_folder(folder: str | Path) -> list[Item]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder; a folder of problem files is needed, one for each step")
-    paths, name = _list_problem_files(folder), folder.resolve().name
+        raise InputError(
+            f"{folder} is not a folder; a folder of problem files is needed, one for each step"
+        )
+    paths = _list_problem_files(folder)
+    name = folder.resolve().name
     if len(paths) < 2:
         n = f"{len(paths)} problem files ({', '.join(SUFFIXES)})"
         raise InputError(f"{folder} holds {n}; a sequence needs two")
     lines = {str(line.get("file")): line for line in read_engine_lines(folder)}
     has_worlds = any("world" in line for line in lines.values())
     # The files of a `Recorder` end with the number of the world, and its lines have the number of the step.
-    numbered = [m.groups() for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem)) and not has_worlds]
+    numbered = [
+        m.groups() for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem)) and not has_worlds
+    ]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     unlisted = [p.name for p in paths if lines and p.name not in lines]
     reason = ""
     if unlisted:
-        reason = f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
+        reason = (
+            f"{unlisted[0]} is not listed in its {ENGINE}, or the recording was killed before that"
+        )
     if len(numbered) > len({(prefix, int(number)) for prefix, number in numbered}):
         reason = "two files have the same number"
     elif len(series) > 1:
@@ -235,7 +258,9 @@ def _list_problem_files(folder: Path) -> list[Path]:
     """List the problem files of a folder, in the numeric order of their names, without the results of an audit."""
     try:
         results = AUDIT_RESULTS if (folder / "numbers.json").is_file() else ()
-        files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.name not in results)
+        files = (
+            p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.name not in results
+        )
         return sorted(files, key=_natural_sort_key)
     except OSError as error:
         raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
@@ -246,7 +271,9 @@ def _is_states_folder(folder: Path) -> bool:
     parent = folder.parent
     if folder.name != STATES_FOLDER:
         return False
-    return (parent / ENGINE).is_file() or any((parent / p.name).is_file() for p in folder.glob("*.npz"))
+    return (parent / ENGINE).is_file() or any(
+        (parent / p.name).is_file() for p in folder.glob("*.npz")
+    )
 
 
 def _natural_sort_key(path: Path) -> list[tuple[int, int | str]]:
@@ -286,9 +313,13 @@ def _list_recorded_steps(folder: Path, items: list[Item]) -> list[Item]:
     for name, group in groupby(list_steps_in_folder(folder), key=lambda item: item.sequence):
         name = name and _take_free_name([name, f"{folder.resolve().parent.name}/{name}"], used)
         found += [replace(s, name=f"{name}[{s.step}]", sequence=name) if name else s for s in group]
-    missing, name = map(_make_item_of_file, _read_unrecorded_steps(folder)), found[-1].sequence
+    missing = map(_make_item_of_file, _read_unrecorded_steps(folder))
+    name = found[-1].sequence
     named = name or folder.resolve().name
-    return [*found, *(replace(item, name=f"{named}, {item.name}", sequence=name) for item in missing)]
+    return [
+        *found,
+        *(replace(item, name=f"{named}, {item.name}", sequence=name) for item in missing),
+    ]
 
 
 def _make_item_of_problem(problem: Problem, name: str, in_memory: Problem | None = None) -> Item:
@@ -313,7 +344,8 @@ def _list_items_of_set(name: str) -> list[Item]:
     steps = Counter[str]()
     for item in items:
         item.sequence = item.name.rpartition(", at=")[0] + ")"
-        item.step, steps[item.sequence] = steps[item.sequence], steps[item.sequence] + 1
+        item.step = steps[item.sequence]
+        steps[item.sequence] = steps[item.sequence] + 1
         item.name = f"{item.sequence}[{item.step}]"
     return items
 
@@ -354,7 +386,9 @@ def _make_names_differ(items: list[Item]) -> list[Item]:
     for same in files.values():
         folders = [Path(item.source).parent.resolve().parts for item in same]
         first, last = min(folders), max(folders)
-        n = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+        n = next(
+            (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first)
+        )
         for item, parts in zip(same, folders, strict=True):
             item.name = escape_unprintable("/".join([*parts[n:], item.name]))
     used = set[str]()
@@ -373,19 +407,30 @@ def _take_free_name(names: list[str], used: set[str]) -> str:
 
 def describe_case(item: Item, run: str) -> Row:
     """Load the problem of an item and return the row that describes it."""
-    p, answer = item.problem, item.load_stored()
-    case, guess = make_case(p), ""
+    p = item.problem
+    answer = item.load_stored()
+    case = make_case(p)
+    guess = ""
     if p.guess is not None and p.qp is None:
         is_stored = answer is not None and np.array_equal(p.guess, answer)
         is_answer = is_stored or residual(p, p.guess).relative <= DEFAULT_SOLVE_TOL
         guess = "answer" if is_answer else "start"
     stored = math.nan if answer is None or answer.shape != (p.m,) else case.judge_impulse(answer)
     return {
-        **CASE_COLUMNS, **case.describe(), "kind": "case", "run": run, "case": item.name,
-        "source": item.source, "sha": hash_problem(p),
-        "sequence": item.sequence, "step": item.step, "identity": "", "stored": stored,
-        "guess": guess, "diagnostics": case.list_diagnostics(),
-    }  # fmt: skip
+        **CASE_COLUMNS,
+        **case.describe(),
+        "kind": "case",
+        "run": run,
+        "case": item.name,
+        "source": item.source,
+        "sha": hash_problem(p),
+        "sequence": item.sequence,
+        "step": item.step,
+        "identity": "",
+        "stored": stored,
+        "guess": guess,
+        "diagnostics": case.list_diagnostics(),
+    }
 
 
 def hash_problem(problem: Problem) -> str:

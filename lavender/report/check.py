@@ -175,9 +175,14 @@ class CrossCheck:
 
 
 def cross_check(
-    problem: Problem, solvers: Iterable[str] | None = None, reference: str = "osqp", *, tol: float = 1e-6,
-    max_iter: int | None = None, time_limit: float | None = None,
-) -> CrossCheck:  # fmt: skip
+    problem: Problem,
+    solvers: Iterable[str] | None = None,
+    reference: str = "osqp",
+    *,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+) -> CrossCheck:
     """Solve from the zero impulse with every solver, and compare each with a judged reference.
 
     A quadratic program is solved by `solve_qp` and judged by its error. The error of the reference (of other problems
@@ -228,20 +233,27 @@ def cross_check(
             get(name)  # Raises UnknownName with similar names.
 
     def run_solver(name: str, tol: float = tol, max_iter: int | None = max_iter) -> Solution:
-        import_numerical_modules(*get(name).requires)  # The first solve's time does not include the import.
+        import_numerical_modules(
+            *get(name).requires
+        )  # The first solve's time does not include the import.
         return case.solve(name, tol=tol, max_iter=max_iter, time_limit=time_limit)
 
     optimum, reference_solver, note = solve_reference(problem, reference, reasons, run_solver)
     rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
-        rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
+        rows = [
+            replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows
+        ]
     return CrossCheck(problem, tol, reference_solver, note, tuple(rows))
 
 
 def _check_solver(
-    problem: Problem, name: str, reason: str | None, optimum: Solution | None,
+    problem: Problem,
+    name: str,
+    reason: str | None,
+    optimum: Solution | None,
     run_solver: Callable[..., Solution],
-) -> CrossCheckRow:  # fmt: skip
+) -> CrossCheckRow:
     """Run one solver and compare its solution with `optimum`.
 
     `reason` explains why the solver does not accept the problem; its bounded variant runs instead, if it has one.
@@ -260,11 +272,16 @@ def _check_solver(
             raise
         # A plug-in may raise any exception; only its own row is lost.
         return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
-    return replace(compare_with_reference(problem, name, solution, optimum), ran="" if other is None else run)
+    return replace(
+        compare_with_reference(problem, name, solution, optimum), ran="" if other is None else run
+    )
 
 
 def solve_reference(
-    problem: Problem, first: str, reasons: dict[str, str | None], run_solver: Callable[..., Solution]
+    problem: Problem,
+    first: str,
+    reasons: dict[str, str | None],
+    run_solver: Callable[..., Solution],
 ) -> tuple[Solution | None, str | None, str]:
     """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
     failed = []
@@ -299,7 +316,9 @@ def solve_reference(
         if relative <= needed:
             note = f"{case.heads['relative'].split()[0]} {format_residual(relative)}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
-        failed.append(f"{name}: relative {format_residual(relative)} above {format_residual(needed)}")
+        failed.append(
+            f"{name}: relative {format_residual(relative)} above {format_residual(needed)}"
+        )
     return None, None, "; ".join(failed)
 
 
@@ -311,22 +330,34 @@ def compare_with_reference(
     form = solution.solver.form and f"{solution.solver.form} form"
     note = "; ".join(filter(None, (form, solution.message)))
     judged = case.judge(solution)
-    fields: dict[str, Any] = {name: judged[name] for name in ("relative", "roundoff_floor", "velocity")} | {
-        "status": solution.status.name, "time": solution.setup_time + solution.solve_time, "solution": solution,
-    }  # fmt: skip
-    verdict, breached = AGREES_UNCOMPARED, False
+    fields: dict[str, Any] = {
+        name: judged[name] for name in ("relative", "roundoff_floor", "velocity")
+    } | {
+        "status": solution.status.name,
+        "time": solution.setup_time + solution.solve_time,
+        "solution": solution,
+    }
+    verdict = AGREES_UNCOMPARED
+    breached = False
     if optimum is not None and np.isfinite(solution.impulse).all():
         with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
             distance, allowed = case.compute_separation(solution, optimum)
             objective = case.compute_objective(solution) - case.compute_objective(optimum)
             slack = float(np.abs(solution.slack - optimum.slack).max(initial=0.0))
-            fields |= {"distance": distance, "allowed": allowed, "slack": slack, "objective": objective}
-        verdict, breached = AGREES, distance > allowed
+            fields |= {
+                "distance": distance,
+                "allowed": allowed,
+                "slack": slack,
+                "objective": objective,
+            }
+        verdict = AGREES
+        breached = distance > allowed
     if breached:
         verdict = BREACH
     elif solution.claim_check == CONTRADICTED:
         known = explain_contradicted_claim(name, problem, solution.status)
-        verdict, note = CLAIM_CONTRADICTED, "; ".join(filter(None, (solution.status_conflict, known, note)))
+        verdict = CLAIM_CONTRADICTED
+        note = "; ".join(filter(None, (solution.status_conflict, known, note)))
     elif solution.claim_check == NOT_PROVEN:
         verdict = UNPROVED
     elif solution.status is Status.INFEASIBLE:
@@ -334,7 +365,8 @@ def compare_with_reference(
     elif solution.status is Status.UNBOUNDED:
         verdict = UNBOUNDED
     elif errors := case.describe_zero(solution):
-        verdict, note = NOTHING_TO_DO, f"{errors}; {note}".rstrip("; ")
+        verdict = NOTHING_TO_DO
+        note = f"{errors}; {note}".rstrip("; ")
     elif not case.is_solved(solution):
         verdict = NOT_SOLVED
     return CrossCheckRow(name, verdict, note=note, **fields)

@@ -43,7 +43,8 @@ def run_self_test() -> dict[str, str]:
     simulation = Simulation("stack")
     for _ in range(20):
         simulation.step()
-    bodies, results = replace(simulation.constraint_problem(), guess=None), {}
+    bodies = replace(simulation.constraint_problem(), guess=None)
+    results = {}
     n = int(bodies.cones.is_contact.sum())
     for name in ("pgs", "block_gauss_seidel", "nncg", "anderson"):
         law = "cone" if name == "anderson" else "coulomb"
@@ -53,10 +54,14 @@ def run_self_test() -> dict[str, str]:
         results[f"{name}, bodies"] = solve(bodies, name, tol=0.0, max_iter=12).impulse
     results["stack, 60 steps"] = simulate_positions("stack", 60)
     # The initial positions of scenes are hashed, too. NumPy draws a pile's rotations, which may depend on its libm.
-    gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
+    gallery = [
+        name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"
+    ]
     positions = [simulate_positions(name, 5) for name in sorted(gallery) if name != "pile"]
     results["gallery, 5 steps"] = np.concatenate(positions)
-    hashes = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in results.items()}
+    hashes = {
+        name: hashlib.sha256(np.ascontiguousarray(x).tobytes()) for name, x in results.items()
+    }
     return {name: digest.hexdigest()[:16] for name, digest in hashes.items()}
 
 
@@ -71,8 +76,9 @@ def collect_installation_facts() -> dict[str, Any]:
     parts = {n: "same" if x == h else f"{x} expected, {h} found" for n, (x, h) in hashes.items()}
     installed = {
         name: ", ".join(f"{p} {v}" for p, v in get_versions(get(name).requires, base=()).items())
-        for name, reason in backends.items() if not reason
-    }  # fmt: skip
+        for name, reason in backends.items()
+        if not reason
+    }
     affinity = getattr(os, "sched_getaffinity", None)
     return {
         "lavender": __version__,
@@ -88,9 +94,13 @@ def collect_installation_facts() -> dict[str, Any]:
         "build": describe_build() | machine.get_processor_clock(),
         "load": machine.get_load_average(),
         "extension": Path(str(serial.__file__)).name,
-        "backends": {name: reason or installed[name] or "installed" for name, reason in backends.items()},
+        "backends": {
+            name: reason or installed[name] or "installed" for name, reason in backends.items()
+        },
         "plug_ins": {
-            name: get_versions([s.distribution], base=()) for name, s in specs().items() if s.distribution
+            name: get_versions([s.distribution], base=())
+            for name, s in specs().items()
+            if s.distribution
         },
         "self_test": parts,
         "same_bits": all(x == "same" for x in parts.values()),

@@ -25,22 +25,50 @@ INK, QUIET, GRID, PAPER = "#010101", "#6f6f6f", "#d8d8d8", "#fefefe"
 BLUE, ORANGE, GREEN, PINK, OLIVE = SERIES = ("#0072b2", "#b34d00", "#007a58", "#a8487f", "#7a5f1e")
 #: Colour of a figure -> variable of the style sheet.
 THEME = {
-    INK: "var(--ink)", QUIET: "var(--quiet)", GRID: "var(--line)", PAPER: "var(--paper)",
+    INK: "var(--ink)",
+    QUIET: "var(--quiet)",
+    GRID: "var(--line)",
+    PAPER: "var(--paper)",
     **{color: f"var(--s{i})" for i, color in enumerate(SERIES)},
-}  # fmt: skip
+}
 STYLE: Any = {
-    "svg.fonttype": "none", "svg.hashsalt": "lavender", "pdf.fonttype": 42, "font.family": "DejaVu Sans",
-    "font.size": 9.5, "axes.labelsize": 9, "xtick.labelsize": 9, "ytick.labelsize": 9, "text.color": INK,
-    "axes.labelcolor": QUIET, "axes.edgecolor": QUIET, "xtick.color": QUIET, "ytick.color": QUIET,
-    "axes.linewidth": 0.7, "axes.spines.top": False, "axes.spines.right": False, "xtick.major.size": 0,
-    "ytick.major.size": 0, "xtick.minor.size": 0, "ytick.minor.size": 0, "grid.color": GRID, "grid.linewidth": 0.5,
-    "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none",
-}  # fmt: skip
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lavender",
+    "pdf.fonttype": 42,
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "text.color": INK,
+    "axes.labelcolor": QUIET,
+    "axes.edgecolor": QUIET,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.major.size": 0,
+    "ytick.major.size": 0,
+    "xtick.minor.size": 0,
+    "ytick.minor.size": 0,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
 FILE_KINDS = ("pdf", "svg", "png")
 MARKERS = "osD^vP"
 MAX_LABEL_LENGTH = 28  # [characters] Longer labels are cut.
-ERROR_COLORS = ((0.5, 0.5, 0.5, 0.09), (0.12, 0.47, 0.75, 0.28), (0.12, 0.47, 0.75, 0.58), (0.12, 0.47, 0.75, 1.0),
-                (0.91, 0.47, 0.16, 1.0), (0.66, 0.22, 0.0, 1.0))  # fmt: skip
+ERROR_COLORS = (
+    (0.5, 0.5, 0.5, 0.09),
+    (0.12, 0.47, 0.75, 0.28),
+    (0.12, 0.47, 0.75, 0.58),
+    (0.12, 0.47, 0.75, 1.0),
+    (0.91, 0.47, 0.16, 1.0),
+    (0.66, 0.22, 0.0, 1.0),
+)
 
 
 class FigureFolder(NamedTuple):
@@ -59,7 +87,9 @@ class Label(NamedTuple):
     weight: str = "normal"
 
 
-def fit_margins(texts: Sequence[str], offset: float = 0.03, left_margin: float = 0.13) -> dict[str, float]:
+def fit_margins(
+    texts: Sequence[str], offset: float = 0.03, left_margin: float = 0.13
+) -> dict[str, float]:
     """Return margins of a figure of `WIDTH` with the longest of some labels at the right of its axes."""
     longest = min(max(map(len, texts), default=0), MAX_LABEL_LENGTH)
     # Bold letters widen short labels relatively more.
@@ -70,14 +100,26 @@ def fit_margins(texts: Sequence[str], offset: float = 0.03, left_margin: float =
 def style_line(i: int) -> dict[str, Any]:
     """Return colour, width, dash and mark of the line of place i: the first is thick, from the seventh on dashed."""
     color = (*SERIES, INK)[i] if i < 6 else QUIET
-    return {"color": color, "linewidth": 1.4 if i else 2.4, "linestyle": "-" if i < 6 else "--",
-            "marker": MARKERS[i % 6], "markersize": 4.5, "zorder": 3 if i else 5}  # fmt: skip
+    return {
+        "color": color,
+        "linewidth": 1.4 if i else 2.4,
+        "linestyle": "-" if i < 6 else "--",
+        "marker": MARKERS[i % 6],
+        "markersize": 4.5,
+        "zorder": 3 if i else 5,
+    }
 
 
 def draw_figure(
-    name: str, fill: Callable[..., str], size: tuple[float, float], margins: Mapping[str, float], *,
-    note: str = "", folder: Path | FigureFolder | None = None, **subplots: Any,
-) -> str:  # fmt: skip
+    name: str,
+    fill: Callable[..., str],
+    size: tuple[float, float],
+    margins: Mapping[str, float],
+    *,
+    note: str = "",
+    folder: Path | FigureFolder | None = None,
+    **subplots: Any,
+) -> str:
     """Return a figure as HTML with an inline SVG; with `folder`, also write it there.
 
     Parameters
@@ -123,7 +165,10 @@ def _adapt_svg(svg: str, name: str, description: str) -> str:
     svg = re.sub(unused, "", svg[svg.index("<svg") :], flags=re.DOTALL)
     for color, variable in THEME.items():
         svg = svg.replace(color, variable)
-    ids = {old: f"{name}-{i}" for i, old in enumerate(dict.fromkeys(re.findall(r'(?<= id=")[^"]+', svg)))}
+    ids = {
+        old: f"{name}-{i}"
+        for i, old in enumerate(dict.fromkeys(re.findall(r'(?<= id=")[^"]+', svg)))
+    }
     used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
 
     def adapt_tag(match: re.Match[str]) -> str:
@@ -148,7 +193,8 @@ def spread_labels(values: Sequence[float], gap: float, low: float, high: float) 
             break
         for i in close:  # Move both labels of a pair by the same distance.
             middle = 0.5 * (y[i] + y[i + 1])
-            y[i], y[i + 1] = middle - 0.5 * gap, middle + 0.5 * gap
+            y[i] = middle - 0.5 * gap
+            y[i + 1] = middle + 0.5 * gap
     y += max(low - y[0], 0.0) if len(y) else 0.0
     for k in reversed(range(len(y))):
         y[k] = min(y[k], high if k == len(y) - 1 else y[k + 1] - gap)
@@ -159,10 +205,13 @@ def spread_labels(values: Sequence[float], gap: float, low: float, high: float) 
 
 def label_ends(axes: Any, labels: Sequence[Label], gap: float = 0.066) -> None:
     """Write labels to the right of the axes at the heights of their lines, without overlaps, with leader lines."""
-    place, back = axes.transAxes, axes.transAxes.inverted()
+    place = axes.transAxes
+    back = axes.transAxes.inverted()
     x = axes.get_xlim()[1]
     heights = [back.transform(axes.transData.transform((x, label.y)))[1] for label in labels]
-    for label, y, moved in zip(labels, heights, spread_labels(heights, gap, 0.0, 1.02), strict=True):
+    for label, y, moved in zip(
+        labels, heights, spread_labels(heights, gap, 0.0, 1.02), strict=True
+    ):
         color = label.color
         axes.plot([1.012, 1.035], [y, moved], transform=place, color=color, lw=0.6, clip_on=False)
         write_label(axes, 1.045, moved, label.text, color=color, weight=label.weight)
@@ -203,13 +252,15 @@ def draw_error_strip(
     levels = [(close, ERROR_COLORS[0])] if close < limit else []
     others = zip((limit / 100.0, limit / 10.0, limit, 10.0 * limit), ERROR_COLORS[1:], strict=False)
     levels += [(edge, color) for edge, color in others if edge > close or edge >= limit]
-    edges, palette = [edge for edge, _ in levels], [*(color for _, color in levels), ERROR_COLORS[-1]]
+    edges = [edge for edge, _ in levels]
+    palette = [*(color for _, color in levels), ERROR_COLORS[-1]]
     colors = np.array(palette)[np.searchsorted(edges, np.nan_to_num(errors))]
     colors[np.isnan(errors)] = 0.0
     axes.imshow(colors, aspect="auto", interpolation="none", extent=extent)
     axes.spines[["left", "bottom"]].set_visible(False)
     names = [f"≤ {format_speed(x)}" for x in edges] + ["more"]
     for i, (color, name) in enumerate(zip(palette, names, strict=True)):
-        y, style = 0.96 - 0.135 * i, {"ms": 7, "mfc": color, "mec": QUIET, "mew": 0.4}
+        y = 0.96 - 0.135 * i
+        style = {"ms": 7, "mfc": color, "mec": QUIET, "mew": 0.4}
         axes.plot([1.03], [y], "s", transform=axes.transAxes, clip_on=False, **style)
         write_label(axes, 1.06, y, name, fontsize=8.2, color=QUIET)

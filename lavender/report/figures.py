@@ -10,9 +10,17 @@ import numpy as np
 from lavender.base.lazy_import import pandas as pd
 from lavender.report import drawing
 from lavender.report.tables import ENGINE_NAME, Contents, format_size, is_plug_in, rank_solvers
-from lavender.report.text import format_count, format_power, format_residual, format_speed, format_time
+from lavender.report.text import (
+    format_count,
+    format_power,
+    format_residual,
+    format_speed,
+    format_time,
+)
 
-MAX_LINES = 6  # Largest number of solvers in a figure, without `ALWAYS_DRAWN`, plug-ins and the engine.
+MAX_LINES = (
+    6  # Largest number of solvers in a figure, without `ALWAYS_DRAWN`, plug-ins and the engine.
+)
 # Most engines sweep as pgs does, and osqp is the most used solver of other packages.
 ALWAYS_DRAWN = ("pgs", "osqp")
 FIGURE_SIZE = (4.9, 3.3)  # [inches]
@@ -24,11 +32,15 @@ def select_drawn_solvers(ranking: Sequence[str]) -> list[str]:
     return [n for n in ranking if n in first or n in (*ALWAYS_DRAWN, ENGINE_NAME) or is_plug_in(n)]
 
 
-def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: drawing.FigureFolder | None) -> str:
+def draw_time_to_accuracy(
+    report: Contents, names: Sequence[str], folder: drawing.FigureFolder | None
+) -> str:
     """Draw the mean time of each solver to each tolerance, with values at the ends of the lines."""
     tolerances = report.tolerances
     means = {t: rank_solvers(report, t, report.subject)["mean"] for t in tolerances}
-    times = {name: [float(means[t].get(name, report.time_limit)) for t in tolerances] for name in names}
+    times = {
+        name: [float(means[t].get(name, report.time_limit)) for t in tolerances] for name in names
+    }
 
     def fill(axes: Any) -> str:
         every = np.concatenate(list(times.values()))
@@ -40,7 +52,9 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: drawin
             style = drawing.style_line(i)
             axes.plot(range(len(own)), own, clip_on=False, **style)
             weight = "normal" if i else "bold"
-            labels.append(drawing.Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight))
+            labels.append(
+                drawing.Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight)
+            )
         axes.set_xticks(range(len(tolerances)), list(map(format_power, tolerances)))
         axes.set_xlabel("residual to reach (1: no impulse)")
         axes.yaxis.set_major_formatter(lambda t, _: format_time(t))
@@ -49,14 +63,19 @@ def draw_time_to_accuracy(report: Contents, names: Sequence[str], folder: drawin
         drawing.label_ends(axes, labels)
         texts = []
         for name, own in times.items():
-            parts = (f"{format_time(t)} to {format_power(x)}" for t, x in zip(own, tolerances, strict=True))
+            parts = (
+                f"{format_time(t)} to {format_power(x)}"
+                for t, x in zip(own, tolerances, strict=True)
+            )
             texts.append(f"{name}: {', '.join(parts)}")
         return f"Mean time. {'; '.join(texts)}"
 
     n, limit = len(report.subject), format_time(report.time_limit)
     note = f"Mean time over {format_count(n, 'problem')}, unsolved ones at {limit} (tables/solvers.csv)."
     margins = drawing.fit_margins([f"{name} {format_time(own[-1])}" for name, own in times.items()])
-    return drawing.draw_figure("time-to-accuracy", fill, FIGURE_SIZE, margins, note=note, folder=folder)
+    return drawing.draw_figure(
+        "time-to-accuracy", fill, FIGURE_SIZE, margins, note=note, folder=folder
+    )
 
 
 def draw_profile(
@@ -84,7 +103,9 @@ def draw_profile(
             y = np.searchsorted(r, x * (1.0 + 1e-9), side="right") / n
             line = drawing.style_line(i) | {"marker": ""} | style
             axes.step(x, y, where="post", gid=f"{solver}--{i}", **line)
-            labels.append(drawing.Label(y[-1], str(solver), line["color"], "normal" if i else "bold"))
+            labels.append(
+                drawing.Label(y[-1], str(solver), line["color"], "normal" if i else "bold")
+            )
         axes.set_xlabel("at most this many times slower than the fastest")
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}×")
         axes.minorticks_off()
@@ -101,7 +122,9 @@ def draw_profile(
         "Share of the problems solved within a factor of the fastest solver (performance profile). Left end: how often "
         "a solver is the fastest; right end: how many it solves (tables/matrix.csv)."
     )
-    return drawing.draw_figure(name, fill, FIGURE_SIZE, drawing.fit_margins(names), note=note, folder=folder)
+    return drawing.draw_figure(
+        name, fill, FIGURE_SIZE, drawing.fit_margins(names), note=note, folder=folder
+    )
 
 
 def draw_error_against_time(
@@ -118,7 +141,11 @@ def draw_error_against_time(
     starts = dict(zip(kept["solver"].astype(str), kept["start"].astype(str), strict=True))
     lines = {}
     for name in names:
-        own = kept if name == ENGINE_NAME else frame[frame["start"].astype(str) == starts.get(name, "")]
+        own = (
+            kept
+            if name == ENGINE_NAME
+            else frame[frame["start"].astype(str) == starts.get(name, "")]
+        )
         own = own[(own["solver"] == name) & np.isfinite(own[column]) & (own["time"] > 0.0)]
         own = own.sort_values("time")
         own = own.assign(best=own[column].astype(float).cummin()).drop_duplicates("best")
@@ -135,9 +162,13 @@ def draw_error_against_time(
         drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
         small = {"fontsize": 8.2, "color": drawing.QUIET}
         drawing.write_label(axes, 1.02, 0.035, f"below {format_power(low)}", **small)
-        place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[1]
+        place = axes.transAxes.inverted().transform(axes.transData.transform((1.0, 1.35 * limit)))[
+            1
+        ]
         text = f"to reach: {format_power(limit)}" if is_program else f"limit {format_speed(limit)}"
-        drawing.write_label(axes, 0.015, place, text, color=drawing.ORANGE, va="bottom", fontsize=8.2)
+        drawing.write_label(
+            axes, 0.015, place, text, color=drawing.ORANGE, va="bottom", fontsize=8.2
+        )
         for i, (name, own) in enumerate(lines.items()):
             style = drawing.style_line(i)
             if name == ENGINE_NAME:
@@ -151,7 +182,8 @@ def draw_error_against_time(
         drawing.write_label(axes, 1.04, 1.0, "time of the last run", **small)
         order = sorted(lines, key=lambda name: lines[name][-1, 0])
         for k, name in enumerate(order):
-            style, y = drawing.style_line(list(lines).index(name)), 0.93 - 0.07 * k
+            style = drawing.style_line(list(lines).index(name))
+            y = 0.93 - 0.07 * k
             mark = "*" if name == ENGINE_NAME else style["marker"]
             place = {"transform": axes.transAxes, "clip_on": False}
             axes.plot([1.06], [y], mark, ms=4.5, color=style["color"], **place)
@@ -159,12 +191,18 @@ def draw_error_against_time(
             text = f"{name} {format_time(lines[name][-1, 0])}"
             drawing.write_label(axes, 1.1, y, text, color=style["color"], weight=weight)
         return f"Error against time on {case}. " + ", ".join(
-            f"{name} reaches {show(own[-1, 1])} in {format_time(own[-1, 0])}" for name, own in lines.items()
+            f"{name} reaches {show(own[-1, 1])} in {format_time(own[-1, 0])}"
+            for name, own in lines.items()
         )
 
     slowest = "The slowest problem, " if len(report.subject) > 1 else ""
     error = "" if is_program else "; its error is that of the worst row"
     note = f"{slowest}{case} ({format_size(report.cases.loc[case])}). A mark is a run{error} (records.csv)."
-    texts = ["time of the last run", *(f"{name} {format_time(own[-1, 0])}" for name, own in lines.items())]
+    texts = [
+        "time of the last run",
+        *(f"{name} {format_time(own[-1, 0])}" for name, own in lines.items()),
+    ]
     margins = drawing.fit_margins(texts, 0.07, left_margin=0.14)
-    return drawing.draw_figure("error-against-time", fill, FIGURE_SIZE, margins, note=note, folder=folder)
+    return drawing.draw_figure(
+        "error-against-time", fill, FIGURE_SIZE, margins, note=note, folder=folder
+    )

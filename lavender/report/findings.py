@@ -41,11 +41,17 @@ MAX_MATRIX_ROWS = 100  # Lines of the folded matrix of all problems; matrix.csv 
 MAX_WARNINGS = 3  # Warnings of one kind on the first screen.
 RATIO_EDGES = (1.1, 2.0, 5.0, 20.0)  # Edges of the colours of the matrix.
 MUCH_FASTER = 1.25  # A solver is faster than another on a problem from this ratio of times on.
-AUTHOR, TITLE = "The lavender developers", "lavender: solvers of rigid-body contact problems, judged in units"
+AUTHOR, TITLE = (
+    "The lavender developers",
+    "lavender: solvers of rigid-body contact problems, judged in units",
+)
 LAW_TITLES = {
-    "linear": "joints only (linear)", "lcp": "contacts without friction, boxes (LCP)", "coulomb": "Coulomb friction",
-    "cone": "friction cone (relaxed)", "program": "quadratic programs",
-}  # fmt: skip
+    "linear": "joints only (linear)",
+    "lcp": "contacts without friction, boxes (LCP)",
+    "coulomb": "Coulomb friction",
+    "cone": "friction cone (relaxed)",
+    "program": "quadratic programs",
+}
 HOW_TO_READ = (
     "Times are wall-clock times of one call of lv.solve (of a quadratic program lv.solve_qp) with the judge and "
     "Python, whose share below about 0.2 ms is as large as the solver's: the minimum of the repetitions. The residual "
@@ -59,17 +65,36 @@ HOW_TO_READ = (
 #: Tables of runs: name, title, function that makes it, and the meaning of its numbers.
 RUN_SECTIONS: tuple[tuple[str, str, Callable[[Contents], pd.DataFrame], str], ...] = (
     ("solvers", "Solvers", tables.tabulate_solvers, "Ranked to the middle tolerance."),
-    ("structures", "By structure and size", tables.tabulate_structures,
-     ("The solver that solves the largest number of problems to each tolerance, then the fastest, with its mean time. "
-      "In a time: the smallest residual at the 90th percentile. Solvers after ≈ tie.")),
-    ("costs", "Time against rows", tables.tabulate_costs,
-     "Time to the middle tolerance as a power of the number of rows."),
-    ("sequences", "Sequences", tables.tabulate_sequences,
-     "All steps, cold and with the impulses of the step before (carried)."),
-    ("sweeps", "Sweeps", tables.tabulate_sweeps,
-     "Largest errors over the steps after the first, after a fixed number of sweeps."),
+    (
+        "structures",
+        "By structure and size",
+        tables.tabulate_structures,
+        (
+            "The solver that solves the largest number of problems to each tolerance, "
+            "then the fastest, with its mean time. "
+            "In a time: the smallest residual at the 90th percentile. Solvers after ≈ tie."
+        ),
+    ),
+    (
+        "costs",
+        "Time against rows",
+        tables.tabulate_costs,
+        "Time to the middle tolerance as a power of the number of rows.",
+    ),
+    (
+        "sequences",
+        "Sequences",
+        tables.tabulate_sequences,
+        "All steps, cold and with the impulses of the step before (carried).",
+    ),
+    (
+        "sweeps",
+        "Sweeps",
+        tables.tabulate_sweeps,
+        "Largest errors over the steps after the first, after a fixed number of sweeps.",
+    ),
     ("runs", "Every time and residual", tables.tabulate_runs, ""),
-)  # fmt: skip
+)
 
 
 class Section(NamedTuple):
@@ -114,7 +139,8 @@ class Report(Contents):
                 return "The zero impulse solves every problem: no solver is ranked."
             stopped = "Stopped: no problem was measured with every solver."
             return stopped if self.is_stopped and len(self.runs) else "Nothing was measured."
-        named, target = self._describe_cases(self.subject), f"to {format_power(self.tolerance)}"
+        named = self._describe_cases(self.subject)
+        target = f"to {format_power(self.tolerance)}"
         stopped = "Stopped early. " if self.is_stopped else ""
         if not self.first:
             best = self.frame.loc[self.frame["relative"].astype(float).idxmin()]
@@ -122,7 +148,8 @@ class Report(Contents):
                 f"{stopped}No solver brings {named} {target}; the smallest residual is "
                 f"{format_residual(best['relative'])}, by {best['solver']}."
             )
-        row, n = self.ranking.loc[self.first], len(self.subject)
+        row = self.ranking.loc[self.first]
+        n = len(self.subject)
         some = f"all {named}" if row["solved"] == n else f"{row['solved']} of {named}"
         solved = named if n == 1 else some
         use = "Stopped early; so far, use" if self.is_stopped else "Use"
@@ -132,7 +159,9 @@ class Report(Contents):
         time = format_time(row["mean"])
         if n == 1:
             return f"{text} {target} in {time}."
-        unsolved = "" if row["solved"] == n else f"; unsolved ones at {format_time(self.time_limit)}"
+        unsolved = (
+            "" if row["solved"] == n else f"; unsolved ones at {format_time(self.time_limit)}"
+        )
         return f"{text}, in {time} on average ({format_time(row['worst'])} at worst, on {row['hardest']}{unsolved})."
 
     @cached_property
@@ -158,7 +187,8 @@ class Report(Contents):
         ]
         if self.is_campaign:
             return f"As many are solved by {_join(rivals.index)}." if len(rivals) else ""
-        ties, others = rivals.index[rivals["tie"]], rivals[~rivals["tie"]].head(3)
+        ties = rivals.index[rivals["tie"]]
+        others = rivals[~rivals["tie"]].head(3)
         texts = [f"{name} takes {r / row['mean']:.1f}×" for name, r in others["mean"].items()]
         texts = [*texts[:1], *(text.replace(" takes", "") for text in texts[1:])]
         tied = f"{_join(ties)} tie{'s' * (len(ties) == 1)} with it" if len(ties) else ""
@@ -167,9 +197,14 @@ class Report(Contents):
 
     def _describe_single_wins(self) -> str:
         """Return on how many problems which other solvers are faster, and the largest factor."""
-        honest = self.ranking.index[(self.ranking["false"] == 0) & (self.ranking.index != ENGINE_NAME)]
-        times = self.get_times(self.tolerance).loc[[*{*honest, self.first}], self.subject].sort_index()
-        own, best = times.loc[self.first], times.min()
+        honest = self.ranking.index[
+            (self.ranking["false"] == 0) & (self.ranking.index != ENGINE_NAME)
+        ]
+        times = (
+            self.get_times(self.tolerance).loc[[*{*honest, self.first}], self.subject].sort_index()
+        )
+        own = times.loc[self.first]
+        best = times.min()
         lost = own.index[own > MUCH_FASTER * best]
         if self.is_campaign or not len(lost) or len(self.subject) == 1:
             return ""
@@ -182,7 +217,9 @@ class Report(Contents):
 
     def _describe_misses(self) -> str:
         """Return the cases that solvers accept and do not solve."""
-        missed = (self.ranking["tried"] - self.ranking["solved"]).sort_values(ascending=False, kind="stable")
+        missed = (self.ranking["tried"] - self.ranking["solved"]).sort_values(
+            ascending=False, kind="stable"
+        )
         missed = missed[missed > 0]
         limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
         if not len(missed):
@@ -208,13 +245,19 @@ class Report(Contents):
             row = solvers.iloc[0]
             text = f"For the {self._describe_cases(steps)} use {first}: it solves {row['solved']}"
             text += f", in {format_time(row['mean'])} on average. "
-        runs = self.ranked_runs[self.ranked_runs["case"].isin(steps) & (self.ranked_runs["solver"] == first)]
+        runs = self.ranked_runs[
+            self.ranked_runs["case"].isin(steps) & (self.ranked_runs["solver"] == first)
+        ]
         runs = runs[(runs["tol"] <= self.tolerance) & (runs["start"].astype(str) == "carried")]
         runs = runs[runs["tol"] == runs["tol"].max()]
         if not len(runs):
             return f"{text}Each step is solved cold."
         carrying = runs["carry_time"].mean()
-        mapping = f" (mapping takes {format_time(carrying)} a step, not included)" if carrying > 0.0 else ""
+        mapping = (
+            f" (mapping takes {format_time(carrying)} a step, not included)"
+            if carrying > 0.0
+            else ""
+        )
         return f"{text}Each step starts from the impulses of the step before{mapping}."
 
     def _describe_engine(self) -> str:
@@ -222,7 +265,8 @@ class Report(Contents):
         answers = tables.read_own_answers(self)
         if not len(answers):
             return ""
-        worst, name = answers.loc[answers["velocity"].idxmax()], str(answers["solver"].mode()[0])
+        worst = answers.loc[answers["velocity"].idxmax()]
+        name = str(answers["solver"].mode()[0])
         above = int((answers["velocity"] > self.error_limit).sum())
         return (
             f"Your engine's own {name.replace('NEWTON', 'Newton')} leaves up to {format_speed(worst['velocity'])} "
@@ -265,7 +309,9 @@ class Report(Contents):
     def warnings(self) -> list[str]:
         """Sentences on a busy machine, missing times, cases that are left out, and possible mistakes in data."""
         shows_times = self.busy and not self.is_campaign and not self.is_sweep_study
-        left_out = [f"{r.case}: {r.reason}" for r in self.skips[self.skips["solver"] == ""].itertuples()]
+        left_out = [
+            f"{r.case}: {r.reason}" for r in self.skips[self.skips["solver"] == ""].itertuples()
+        ]
         # A sentence for each solver with impulses that add energy beyond the work of the targets.
         gains = self.frame[self.frame["energy_gain"] > 0.0]
         worst = gains.loc[gains.groupby("solver", observed=True)["energy_gain"].idxmax()]
@@ -275,8 +321,16 @@ class Report(Contents):
             for r in worst.sort_values("energy_gain", ascending=False).itertuples()
         ]
         return [
-            *([f"{self.busy} The times are invalid; measure again with --no-reuse."] if shows_times else []),
-            *(["Error and robustness without times: runs end by iterations."] if self.is_campaign else []),
+            *(
+                [f"{self.busy} The times are invalid; measure again with --no-reuse."]
+                if shows_times
+                else []
+            ),
+            *(
+                ["Error and robustness without times: runs end by iterations."]
+                if self.is_campaign
+                else []
+            ),
             *_limit("left out", left_out),
             *_limit("gains energy", energy_gains),
             *_limit("suspicious", [f"{case}: {reason}" for case, reason in list_diagnostics(self)]),
@@ -309,7 +363,9 @@ class Report(Contents):
             solvers=("solver", lambda x: _join(dict.fromkeys(s for s in x if s), 99)),
             cases=("case", lambda x: _join(dict.fromkeys(x), 4)),
         )
-        sections["skipped"] = Section("Not run, and why", skips.reset_index()[["solvers", "cases", "reason"]])
+        sections["skipped"] = Section(
+            "Not run, and why", skips.reset_index()[["solvers", "cases", "reason"]]
+        )
         diagnostics = pd.DataFrame(list_diagnostics(self), columns=["case", "possible mistake"])
         sections["diagnostics"] = Section("Possible mistakes in the data", diagnostics)
         return {name: section for name, section in sections.items() if len(section.frame)}
@@ -319,7 +375,9 @@ class Report(Contents):
     def make_page(self, folder: FigureFolder | None = None, with_figures: bool = True) -> Page:
         """Make the page; with `folder`, the figures are also written there."""
         n, solvers = len(self.frame["case"].unique()), len(self.frame["solver"].unique())
-        limit = "" if self.is_campaign or not n else f" · limit {format_time(self.time_limit)} a solve"
+        limit = (
+            "" if self.is_campaign or not n else f" · limit {format_time(self.time_limit)} a solve"
+        )
         source = f"lavender report · {format_count(n, 'problem')} × {format_count(solvers, 'solver')}{limit}"
         blocks: list[Any] = []
         if self.is_sweep_study:
@@ -341,23 +399,33 @@ class Report(Contents):
         machine = fold_table("Machine, versions, settings", self.describe_run())
         notes = {"folded": [{"note": HOW_TO_READ}], "title": "How to read this page", "open": False}
         return Page(
-            title, source, self.verdict, self.sentences, [line.strip() for line in self.code if "lv.solve" in line],
-            alarms=self.alarms, warnings=self.warnings,
-            blocks=[*blocks, *changes, *folded, machine, notes], footer=self._make_footer(),
-            mark=self.sweeps.mark if self.is_sweep_study else "", is_bad=self.is_sweep_study and self.sweeps.is_bad,
-        )  # fmt: skip
+            title,
+            source,
+            self.verdict,
+            self.sentences,
+            [line.strip() for line in self.code if "lv.solve" in line],
+            alarms=self.alarms,
+            warnings=self.warnings,
+            blocks=[*blocks, *changes, *folded, machine, notes],
+            footer=self._make_footer(),
+            mark=self.sweeps.mark if self.is_sweep_study else "",
+            is_bad=self.is_sweep_study and self.sweeps.is_bad,
+        )
 
     def _make_blocks(self, folder: FigureFolder | None, with_figures: bool) -> list[Any]:
         """Make the table of solvers, the matrix and the figures."""
         names = figures.select_drawn_solvers(list(map(str, self.ranking.index)))
         times = self.get_times(self.tolerance)
-        n, drawn = len(self.subject), dict[str, list[Any]]()
+        n = len(self.subject)
+        drawn = dict[str, list[Any]]()
         if with_figures and not self.is_campaign and names:
             best = times[self.subject].min()
             slowest = str(best.idxmax()) if best.notna().any() else self.subject[0]
             drawn["error"] = [Markup(figures.draw_error_against_time(self, slowest, names, folder))]
             if n > 1:
-                drawn["profile"] = [Markup(figures.draw_profile(times[self.subject], names, folder))]
+                drawn["profile"] = [
+                    Markup(figures.draw_profile(times[self.subject], names, folder))
+                ]
             if n > 1 and len(self.tolerances) > 1:
                 drawn["slope"] = [Markup(figures.draw_time_to_accuracy(self, names, folder))]
         beside = drawn.get("slope" if n > 1 else "error", [])
@@ -367,24 +435,31 @@ class Report(Contents):
             if any(map(len, (drawn.get("profile", ()), drawn.get("error", ())))):
                 blocks.append({"pair": [drawn.get("profile", []), drawn.get("error", [])]})
             if len(self.subject) > MAX_CASES and not self.is_campaign:
-                single = self.cases.loc[self.subject].sort_values(["law", "rows"]).head(MAX_MATRIX_ROWS)
-                every = [(LAW_TITLES.get(law, law), case, [case]) for case, law in single["law"].items()]
+                single = (
+                    self.cases.loc[self.subject].sort_values(["law", "rows"]).head(MAX_MATRIX_ROWS)
+                )
+                every = [
+                    (LAW_TITLES.get(law, law), case, [case]) for case, law in single["law"].items()
+                ]
                 matrix = [self._make_matrix(every)]
                 blocks.append({"folded": matrix, "title": "Every problem × solver", "open": False})
         return blocks
 
     def _make_league(self) -> dict[str, Any]:
         """Make the table of the first ten solvers, all plug-ins and the engine."""
-        ranking, rows = self.ranking, list[Any]()
+        ranking = self.ranking
+        rows = list[Any]()
         always = [name == ENGINE_NAME or is_plug_in(name) for name in ranking.index]
         shown = ranking[(np.arange(len(ranking)) < MAX_SOLVERS) | np.array(always, bool)]
         n = int(ranking["cases"].iloc[0]) if len(ranking) else 0
         means = shown["mean"].clip(lower=1e-9)
-        low, high = np.log10(means.min()) - 0.03, np.log10(means.max()) + 0.03
+        low = np.log10(means.min()) - 0.03
+        high = np.log10(means.max()) + 0.03
         has_false = bool((shown["false"] > 0).any())
         for name, row in shown.iterrows():
             css = "first" if name == self.first else ""
-            missed, refused = int(row["tried"] - row["solved"]), int(n - row["tried"])
+            missed = int(row["tried"] - row["solved"])
+            refused = int(n - row["tried"])
             notes = [f"{missed} ✗"] if missed else []
             notes += [f"{refused} not accepted"] if refused else []
             notes += ["tie"] if row["tie"] and shown["tie"].sum() > 1 else []
@@ -393,9 +468,15 @@ class Report(Contents):
                 ratio = row["mean"] / ranking.loc[self.first or ranking.index[0], "mean"]
                 place = 100.0 * (np.log10(max(row["mean"], 1e-9)) - low) / (high - low)
                 dot = Markup(f'<span class="dot"><i style="left:{place:.1f}%"></i></span>')
-                cells += [(format_time(row["mean"]), css, ""), (f"{ratio:.1f}", css, ""), (dot, "bar", "")]
+                cells += [
+                    (format_time(row["mean"]), css, ""),
+                    (f"{ratio:.1f}", css, ""),
+                    (dot, "bar", ""),
+                ]
             if has_false:
-                cells.append((f"{row['false']} ✗" if row["false"] else "0", "bad" * bool(row["false"]), ""))
+                cells.append(
+                    (f"{row['false']} ✗" if row["false"] else "0", "bad" * bool(row["false"]), "")
+                )
             rows.append([*cells, (", ".join(notes), "text q wide" + " bad" * bool(missed), "")])
         heads: list[Any] = ["solver", "solved"]
         heads += [] if self.is_campaign else [f"{'mean ' * (n > 1)}time", "× best", ("", "bar", "")]
@@ -406,7 +487,11 @@ class Report(Contents):
                 f"Shifted geometric mean (10 µs), on a logarithmic scale; a problem not solved or not accepted "
                 f"(its law, form or size) counts as {format_time(self.time_limit)}."
             )
-            note += f" The table below has all {len(ranking)} solvers." if len(ranking) > len(shown) else ""
+            note += (
+                f" The table below has all {len(ranking)} solvers."
+                if len(ranking) > len(shown)
+                else ""
+            )
         named = f"all {n} problems" if n > 1 else "one problem"
         small = f"{named}, to residual {format_power(self.tolerance)}"
         heads.append(("", "wide", ""))
@@ -434,7 +519,8 @@ class Report(Contents):
         """Make the matrix of problems × solvers: times as multiples of the fastest solver's."""
         times = self.get_times(self.tolerance)
         order = tables.order_solvers(self)
-        best, accepted = times.min(), self.accepted
+        best = times.min()
+        accepted = self.accepted
         ratios = times.div(best.where(best > 0.0, 1.0), axis=1)
         best_runs = self.ranked_runs.sort_values("relative", key=lambda x: x.astype(float))
         best_runs = best_runs.drop_duplicates(["solver", "case"]).set_index(["solver", "case"])
@@ -458,7 +544,11 @@ class Report(Contents):
                 missed = int((is_accepted & times.loc[solver, cases].isna()).sum())
                 ratio = ratios.loc[solver, cases].median()
                 if missed:
-                    run = best_runs.loc[(solver, cases[0])] if (solver, cases[0]) in best_runs.index else None
+                    run = (
+                        best_runs.loc[(solver, cases[0])]
+                        if (solver, cases[0]) in best_runs.index
+                        else None
+                    )
                     why = f"{solver}: {missed} of {len(cases)} not solved"
                     why += f", else {ratio:.1f}× the fastest" if ratio == ratio else ""
                     if len(cases) == 1 and run is not None:
@@ -466,7 +556,9 @@ class Report(Contents):
                         why = why.removesuffix(", residual inf")
                     cells.append(("✗" if len(cases) == 1 else f"{missed} ✗", "cx", why))
                 else:
-                    text = "1" if ratio < 1.05 else f"{ratio:.1f}" if ratio < 9.95 else f"{ratio:.0f}"
+                    text = (
+                        "1" if ratio < 1.05 else f"{ratio:.1f}" if ratio < 9.95 else f"{ratio:.0f}"
+                    )
                     text = "✓" if self.is_campaign else text if ratio < 999.5 else ">999"
                     mean = "" if self.is_campaign else format_time(times.loc[solver, cases].mean())
                     color = f"c{np.searchsorted(RATIO_EDGES, ratio)}"
@@ -475,30 +567,56 @@ class Report(Contents):
         solved = times.notna().sum(axis=1)
         foot = ["solved", ("", "b", ""), *(str(solved[name]) for name in order)]
         limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
-        key = [("1", "c0"), ("to 2", "c1"), ("to 5", "c2"), ("to 20", "c3"), ("slower", "c4"), ("✗", "cx"),
-               (f"not solved{limit}; · not accepted", ""), ("Columns: best first.", "wide")]  # fmt: skip
+        key = [
+            ("1", "c0"),
+            ("to 2", "c1"),
+            ("to 5", "c2"),
+            ("to 20", "c3"),
+            ("slower", "c4"),
+            ("✗", "cx"),
+            (f"not solved{limit}; · not accepted", ""),
+            ("Columns: best first.", "wide"),
+        ]
         names = ((Markup("<span>{}</span>").format(name), "", "") for name in order)
         heads = ["", ("fastest", "b", ""), *names]
         return make_table(
-            rows, heads, foot=foot, key=key, classes="matrix ratios",
+            rows,
+            heads,
+            foot=foot,
+            key=key,
+            classes="matrix ratios",
             title="Time on each problem, as a multiple of the fastest solver",
             small=f"to residual {format_power(self.tolerance)}",
-        )  # fmt: skip
+        )
 
     def describe_run(self) -> pd.DataFrame:
         """Return the machine, versions and plan of the newest run."""
-        run, facts = self.machine, {}
+        run = self.machine
+        facts = {}
         if run:
-            lists = {"versions": {"lavender": run["lavender"], "Python": run["python"], **run["versions"]},
-                     "build": run["build"] | ({"load": run["load"]} if run["load"] == run["load"] else {}),
-                     "plan": run["plan"]}  # fmt: skip
-            counts = format_count(self.frame["case"].nunique(), "case"), format_count(len(self.newest), "run")
+            lists = {
+                "versions": {
+                    "lavender": run["lavender"],
+                    "Python": run["python"],
+                    **run["versions"],
+                },
+                "build": run["build"]
+                | ({"load": run["load"]} if run["load"] == run["load"] else {}),
+                "plan": run["plan"],
+            }
+            counts = (
+                format_count(self.frame["case"].nunique(), "case"),
+                format_count(len(self.newest), "run"),
+            )
             facts = {
                 "run": f"{run['run']}, started {run['started']}; {', '.join(counts)}",
                 "machine": f"{run['cpu']}, {run['cores']} cores; {run['platform']}",
                 "threads": f"{run['threads']} for BLAS and OpenMP while timing; runs are serial",
             }
-            texts = {name: "; ".join(f"{key} {x}" for key, x in some.items()) for name, some in lists.items()}
+            texts = {
+                name: "; ".join(f"{key} {x}" for key, x in some.items())
+                for name, some in lists.items()
+            }
             facts |= {name: text for name, text in texts.items() if text}
         return pd.DataFrame(facts.items(), columns=["fact", "value"], dtype=object)
 
@@ -522,9 +640,12 @@ class Report(Contents):
 
 
 def write(
-    source: pd.DataFrame | Report, folder: str | Path, *, figures: bool = True,
+    source: pd.DataFrame | Report,
+    folder: str | Path,
+    *,
+    figures: bool = True,
     watch: Callable[[Event], None] = lambda event: None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write `index.html`, `records.csv`, `summary.md`, `figures/*` and the files of `tables`: .csv, .tex and .bib.
 
     Parameters
@@ -553,12 +674,15 @@ def write(
         raise InputError(
             f"source is a {type(source).__name__}; the DataFrame of lavender.report.run or a Report is needed"
         )
-    folder, files = Path(folder), dict[str, Any]({"records.csv": report.runs})
+    folder = Path(folder)
+    files = dict[str, Any]({"records.csv": report.runs})
     files |= {f"tables/{name}.csv": section.frame for name, section in report.sections.items()}
     if "solvers" in report.sections and len(report.ranked_runs):
         files["tables/matrix.csv"] = lambda: tables.tabulate_matrix(report)
         files["tables/solvers.tex"] = lambda: make_latex_table(report)
-        files["tables/lavender.bib"] = (  # The entry of BibTeX that cites the version which made the report.
+        files[
+            "tables/lavender.bib"
+        ] = (  # The entry of BibTeX that cites the version which made the report.
             f"@software{{lavender, author = {{{{{AUTHOR}}}}}, title = {{{{{TITLE}}}}}, "
             f"version = {{{report.machine['lavender']}}}, year = {{{report.machine['started'][:4]}}}}}\n"
         )
@@ -566,24 +690,35 @@ def write(
     drawn = FigureFolder(folder / "figures", report.figure_kinds)
     files["index.html"] = lambda: report.make_page(drawn, figures).render()
     order = {name: i for i, name in enumerate(files)}
-    write_files(folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing")))
+    write_files(
+        folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing"))
+    )
     return folder / "index.html"
 
 
 def make_latex_table(report: Report) -> str:
     """Return the table of solvers for a paper with the columns of the report; needs the package booktabs."""
     table = tables.tabulate_solvers(report)
-    times = {format_tol(x): f"to {format_tol(x)} [s]" for x in report.tolerances if not report.is_campaign}
+    times = {
+        format_tol(x): f"to {format_tol(x)} [s]"
+        for x in report.tolerances
+        if not report.is_campaign
+    }
     middle = times.get(format_tol(report.tolerance), "")
     known: dict[str, Any] = {
-        "solved": table["solved"].astype(str) + "/" + table["cases"].astype(str), "accepted": table["accepted"],
+        "solved": table["solved"].astype(str) + "/" + table["cases"].astype(str),
+        "accepted": table["accepted"],
         "false": table["false claims"],
         **{f"{word}": 1e3 * table[head] for word, head in times.items()},
-    }  # fmt: skip
+    }
     if times:
-        known |= {"ratio": table[middle] / table[middle].min(), "slowest": 1e3 * table["slowest [s]"]}
+        known |= {
+            "ratio": table[middle] / table[middle].min(),
+            "slowest": 1e3 * table["slowest [s]"],
+        }
     columns = [
-        x if x in PAPER_COLUMNS else format_tol(float(x)) for x in report.columns or ("solved", *times)
+        x if x in PAPER_COLUMNS else format_tol(float(x))
+        for x in report.columns or ("solved", *times)
     ]
     check_columns(columns, list(known))
     heads = {"false": "false claims", "ratio": r"$\times$ best", "slowest": "slowest [ms]"} | {
@@ -604,13 +739,20 @@ def make_latex_table(report: Report) -> str:
     )
     style = paper.style.format(precision=3, na_rep="--", subset=numbers)
     style = style.highlight_min(subset=numbers, props="textbf:--rwrap;") if numbers else style
-    return style.to_latex(hrules=True, column_format="l" + "r" * len(columns), label="tab:solvers", position="t",
-                          caption=caption)  # fmt: skip
+    return style.to_latex(
+        hrules=True,
+        column_format="l" + "r" * len(columns),
+        label="tab:solvers",
+        position="t",
+        caption=caption,
+    )
 
 
 def _escape_latex(text: str) -> str:
     """Escape the characters that LaTeX reads as commands."""
-    return re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/")).replace("~", "-").replace("^", "-")
+    return (
+        re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/")).replace("~", "-").replace("^", "-")
+    )
 
 
 def summarise(report: Report) -> str:
@@ -637,18 +779,28 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
         if not complete and name not in short:
             continue
         note = f": {section.note}" if section.note else ""
-        frame, optional = section.frame, tuple[str, ...]()
+        frame = section.frame
+        optional = tuple[str, ...]()
         if complete or name == "changes":
             console.print(f"\n{section.title}{note}", style="bold", highlight=False, markup=False)
         else:
             console.print()
         if not complete and name == "sweeps":
             starts = ("carried", "cold")
-            errors = [f"{kind} error, {start} [m/s]" for kind in ("velocity", "motion") for start in starts]
-            wanted = ["sequence"] * (frame["sequence"].nunique() > 1) + ["solver", "sweeps", *errors]
+            errors = [
+                f"{kind} error, {start} [m/s]"
+                for kind in ("velocity", "motion")
+                for start in starts
+            ]
+            wanted = ["sequence"] * (frame["sequence"].nunique() > 1) + [
+                "solver",
+                "sweeps",
+                *errors,
+            ]
             frame = frame[[head for head in wanted if head in frame]]
         elif not complete:
-            frame, optional = frame.head(MAX_SOLVERS), ("tie", "false claims", "accepted", "slowest [s]")
+            frame = frame.head(MAX_SOLVERS)
+            optional = ("tie", "false claims", "accepted", "slowest [s]")
         print_table(console, frame, optional)
 
 
@@ -674,7 +826,8 @@ def list_diagnostics(report: Report) -> list[tuple[str, str]]:
     table = report.cases[["case", "sequence", "diagnostics"]].explode("diagnostics").dropna()
     table["diagnostics"] = table["diagnostics"].map(lambda text: escape_unprintable(str(text)))
     place = table["sequence"].where(table["sequence"] != "", table["case"])
-    found, kind = [], table["diagnostics"].map(lambda text: text.partition(":")[0])
+    found = []
+    kind = table["diagnostics"].map(lambda text: text.partition(":")[0])
     steps = report.cases["sequence"].value_counts()
     for (name, _), same in table.groupby([place, kind], sort=False):
         n = same["case"].nunique()

@@ -38,7 +38,12 @@ def _read_cpuinfo_entry(name: str) -> str:
 
 def get_cpu_name() -> str:
     """Return the model of the processor, as the system names it."""
-    return _read_cpuinfo_entry("model name|Model") or platform.processor() or platform.machine() or "unknown"
+    return (
+        _read_cpuinfo_entry("model name|Model")
+        or platform.processor()
+        or platform.machine()
+        or "unknown"
+    )
 
 
 def get_total_memory() -> int:
@@ -52,7 +57,9 @@ def get_total_memory() -> int:
     return min((n for n in found if n > 0), default=0)
 
 
-def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:
+def get_versions(
+    packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES
+) -> dict[str, str]:
     """Return the version of each installed distribution, or of a module's; missing ones are left out."""
     found = {}
     for name in sorted({*base, *packages}):
@@ -67,17 +74,36 @@ def get_versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAG
 def describe_run(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> dict[str, Any]:
     """Return the row of a machine, its versions and a plan; `run` is a hash of these, without the time."""
     facts: dict[str, Any] = {
-        "lavender": __version__, "python": platform.python_version(), "platform": platform.platform(),
-        "cpu": get_cpu_name(), "cores": os.cpu_count() or 1, "threads": 1, "versions": get_versions(packages),
-    }  # fmt: skip
+        "lavender": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": get_cpu_name(),
+        "cores": os.cpu_count() or 1,
+        "threads": 1,
+        "versions": get_versions(packages),
+    }
     build = describe_build()
     # These facts affect a single measurement; the selection of cases and solvers does not.
-    identity = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}, "build": build}
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    identity = {
+        **facts,
+        "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan},
+        "build": build,
+    }
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[
+        :12
+    ]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     build = build | get_processor_clock()
-    return {"kind": "machine", "run": digest, "started": started, "plan": dict(plan), "build": build,
-            "load": get_load_average(), "whole": True, **facts}  # fmt: skip
+    return {
+        "kind": "machine",
+        "run": digest,
+        "started": started,
+        "plan": dict(plan),
+        "build": build,
+        "load": get_load_average(),
+        "whole": True,
+        **facts,
+    }
 
 
 def get_load_average() -> float | None:
@@ -94,7 +120,9 @@ def count_runnable_processes() -> float | None:
     return get_load_average()
 
 
-def make_busy_warning(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
+def make_busy_warning(
+    loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1
+) -> str:
     """Return a warning if other processes used the processors, else an empty text.
 
     `loads` are the numbers of runnable processes during a measurement (None if unknown), `own` of them its own.
@@ -114,7 +142,9 @@ def get_processor_clock() -> dict[str, str]:
     mhz = _read_cpuinfo_entry("cpu MHz")
     found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
     with contextlib.suppress(OSError):
-        found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
+        found["governor"] = (
+            Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
+        )
     return found
 
 
@@ -126,12 +156,24 @@ def describe_build() -> dict[str, str]:
     found = {}
     if (package.parent / ".git").exists():
         # The commit of a checkout, marked if files differ from it.
-        command = ["git", "--no-optional-locks", "-C", str(package.parent), "describe", "--always", "--dirty"]
+        command = [
+            "git",
+            "--no-optional-locks",
+            "-C",
+            str(package.parent),
+            "describe",
+            "--always",
+            "--dirty",
+        ]
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             described = subprocess.run(
-                [*command, "--abbrev=12", "--exclude=*"], capture_output=True, encoding="utf-8", errors="replace",
-                timeout=10, check=True,
-            )  # fmt: skip
+                [*command, "--abbrev=12", "--exclude=*"],
+                capture_output=True,
+                encoding="utf-8",
+                errors="replace",
+                timeout=10,
+                check=True,
+            )
             found["commit"] = described.stdout.strip()
     kernels = hashlib.sha256()
     for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
@@ -139,7 +181,9 @@ def describe_build() -> dict[str, str]:
     found["kernels"] = kernels.hexdigest()[:12]
     found["solvers"] = hash_solver_sources()
     content = library.read_bytes()  # A compiled module names its compiler and Cython's version.
-    if compiler := re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", content):
+    if compiler := re.search(
+        rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", content
+    ):
         found["compiler"] = compiler[0].decode()
     if cython := re.search(rb"_cython_(\d+)_(\d+)_(\d+)", content):
         found["cython"] = ".".join(part.decode() for part in cython.groups())
@@ -148,7 +192,11 @@ def describe_build() -> dict[str, str]:
     require_packages("the description of the machine", "threadpoolctl")
     from threadpoolctl import threadpool_info
 
-    blas = [f"{i['internal_api']} {i['version']}" for i in threadpool_info() if i.get("user_api") == "blas"]
+    blas = [
+        f"{i['internal_api']} {i['version']}"
+        for i in threadpool_info()
+        if i.get("user_api") == "blas"
+    ]
     return found | {"blas": ", ".join(sorted(set(blas)))}
 
 
@@ -158,7 +206,9 @@ def hash_solver_sources() -> str:
     for name, spec in sorted(registry.specs().items()):
         factory = spec.factory
         module = factory.partition(":")[0] if isinstance(factory, str) else factory.__module__
-        with contextlib.suppress(ImportError, ValueError, OSError):  # no such module, or one without a file
+        with contextlib.suppress(
+            ImportError, ValueError, OSError
+        ):  # no such module, or one without a file
             found = importlib.util.find_spec(module)
             if found is not None and found.origin is not None:
                 sources.update(name.encode() + Path(found.origin).read_bytes())

@@ -51,7 +51,9 @@ class Page:
     alarms: Sequence[str] = ()  # Sentences on wrong results, shown first.
     warnings: Sequence[str] = ()  # Sentences on conditions on which shown numbers depend.
     blocks: Sequence[Any] = ()  # Blocks as the module describes them.
-    footer: Sequence[Any] = field(default_factory=list)  # Files, versions, machine, date and command.
+    footer: Sequence[Any] = field(
+        default_factory=list
+    )  # Files, versions, machine, date and command.
 
     def render(self) -> str:
         """Return the page as HTML."""
@@ -59,20 +61,29 @@ class Page:
         import jinja2
 
         environment = jinja2.Environment(
-            loader=jinja2.PackageLoader("lavender.report"), autoescape=True, undefined=jinja2.StrictUndefined,
-            trim_blocks=True, lstrip_blocks=True,
-        )  # fmt: skip
+            loader=jinja2.PackageLoader("lavender.report"),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
         return environment.get_template("page.html.j2").render(page=self)
 
     def print_head(self, console: Console) -> None:
         """Print the verdict, the sentences, the lines to copy and the warnings."""
         for text, style in (
             (f"{self.mark} {self.verdict}".strip(), "bold"),
-            *((text, "bold red") for text in self.alarms), *((text, "") for text in self.sentences),
-            *((f"    {line}", "") for line in self.code), *((text, "yellow") for text in self.warnings),
-        ):  # fmt: skip
-            text = text.replace("\u00a0", " ").replace("\u202f", "")  # Units do not break on a page only.
-            console.print(text, style=style, highlight=False, markup=False, soft_wrap=text.startswith("    "))
+            *((text, "bold red") for text in self.alarms),
+            *((text, "") for text in self.sentences),
+            *((f"    {line}", "") for line in self.code),
+            *((text, "yellow") for text in self.warnings),
+        ):
+            text = text.replace("\u00a0", " ").replace(
+                "\u202f", ""
+            )  # Units do not break on a page only.
+            console.print(
+                text, style=style, highlight=False, markup=False, soft_wrap=text.startswith("    ")
+            )
 
 
 def check_columns(columns: Sequence[str], known: Sequence[str] = ()) -> None:
@@ -85,12 +96,27 @@ def check_columns(columns: Sequence[str], known: Sequence[str] = ()) -> None:
 
 
 def make_table(
-    rows: Sequence[Any], heads: Sequence[Any] = (), *, title: str = "", small: str = "", note: str = "",
-    key: Sequence[tuple[str, str]] = (), classes: str = "", foot: Sequence[Any] = (),
-) -> dict[str, Any]:  # fmt: skip
+    rows: Sequence[Any],
+    heads: Sequence[Any] = (),
+    *,
+    title: str = "",
+    small: str = "",
+    note: str = "",
+    key: Sequence[tuple[str, str]] = (),
+    classes: str = "",
+    foot: Sequence[Any] = (),
+) -> dict[str, Any]:
     """Make the block of a table as the module describes it."""
-    return {"rows": rows, "heads": heads, "title": title, "small": small, "note": note, "key": key,
-            "classes": classes, "foot": foot}  # fmt: skip
+    return {
+        "rows": rows,
+        "heads": heads,
+        "title": title,
+        "small": small,
+        "note": note,
+        "key": key,
+        "classes": classes,
+        "foot": foot,
+    }
 
 
 def make_shares(
@@ -116,9 +142,11 @@ def tabulate_frame(frame: pd.DataFrame, is_grouped: bool = False, **more: Any) -
     With `is_grouped`, equal first cells of consecutive rows become one line above these rows.
     """
     texts = format_cells(frame.head(MAX_ROWS))
-    numbers, rows = list_number_heads(texts), list[Any]()
+    numbers = list_number_heads(texts)
+    rows = list[Any]()
     is_grouped = is_grouped and bool(texts.shape[1] > 1)
-    first, group = int(is_grouped), None
+    first = int(is_grouped)
+    group = None
     for row in texts.to_numpy().tolist():
         if is_grouped and row[0] != group:
             group = row[0]
@@ -134,6 +162,10 @@ def fold_table(
     title: str, frame: pd.DataFrame, note: str = "", is_open: bool = False, is_grouped: bool = False
 ) -> dict[str, Any]:
     """Make a folded block with the table of a frame."""
-    more = f" The first {MAX_ROWS} of {len(frame)} rows; the file has all." if len(frame) > MAX_ROWS else ""
+    more = (
+        f" The first {MAX_ROWS} of {len(frame)} rows; the file has all."
+        if len(frame) > MAX_ROWS
+        else ""
+    )
     table = tabulate_frame(frame, is_grouped, note=f"{note}{more}".strip())
     return {"folded": [table], "title": title, "open": is_open}

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
-MAX_WORD_WIDTH = 24  # [columns] A column of words becomes as narrow as its longest word, or as this width.
+MAX_WORD_WIDTH = (
+    24  # [columns] A column of words becomes as narrow as its longest word, or as this width.
+)
 #: Matches texts that are aligned like numbers, to the right.
 NUMBER_CELL = re.compile(
     r"|–|[-+]?(?:\d[\d.\u202f]*(?:e[-+]?\d+)?|inf|nan)"
@@ -51,9 +53,12 @@ def format_cells(frame: pd.DataFrame) -> pd.DataFrame:
             return NONE
         return f"{x:g}" if number else escape_unprintable(str(x))
 
-    texts = [[write(x, number) for x in column] for column, number in zip(columns, is_float, strict=True)]
+    texts = [
+        [write(x, number) for x in column] for column, number in zip(columns, is_float, strict=True)
+    ]
     unit, texts_of_times = format_times_in_one_unit([x for i in times for x in columns[i]])
-    texts_of_sizes, n = format_sizes([x for i in sizes for x in columns[i]]), len(frame)
+    texts_of_sizes = format_sizes([x for i in sizes for x in columns[i]])
+    n = len(frame)
     for group, written in ((times, texts_of_times), (sizes, texts_of_sizes)):
         for k, i in enumerate(group):
             texts[i] = written[k * n : (k + 1) * n]
@@ -64,7 +69,11 @@ def format_cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 def list_number_heads(texts: pd.DataFrame) -> set[str]:
     """Return the heads of the columns that are aligned to the right: those with numbers only."""
-    return {head for head, cells in texts.items() if all(map(NUMBER_CELL.fullmatch, cells)) and any(cells)}
+    return {
+        head
+        for head, cells in texts.items()
+        if all(map(NUMBER_CELL.fullmatch, cells)) and any(cells)
+    }
 
 
 def format_markdown(frame: pd.DataFrame) -> list[str]:
@@ -89,19 +98,28 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
     from rich.table import Table
     from rich.text import Text
 
-    remaining, left_out, keeps_words = [head for head in optional if head in frame], list[str](), True
+    remaining = [head for head in optional if head in frame]
+    left_out = list[str]()
+    keeps_words = True
     while True:
         texts = format_cells(frame)
-        numbers, width = list_number_heads(texts), 2 * (texts.shape[1] - 1)
+        numbers = list_number_heads(texts)
+        width = 2 * (texts.shape[1] - 1)
         grid = Table(box=None, pad_edge=False, header_style="bold")
         for head, cells in texts.items():
             if head in numbers:
-                longest = min(max(map(len, head.split()), default=0), MAX_WORD_WIDTH) if keeps_words else 0
+                longest = (
+                    min(max(map(len, head.split()), default=0), MAX_WORD_WIDTH)
+                    if keeps_words
+                    else 0
+                )
                 lines = textwrap.wrap(head, max(MIN_HEAD_WIDTH, longest, *map(len, cells)))
                 smallest = max(map(len, [*cells, *lines]))
                 grid.add_column(Text("\n".join(lines)), justify="right", no_wrap=True)
             else:
-                longest = max((len(word) for text in (head, *cells) for word in text.split()), default=1)
+                longest = max(
+                    (len(word) for text in (head, *cells) for word in text.split()), default=1
+                )
                 smallest = min(longest, MAX_WORD_WIDTH)
                 grid.add_column(Text(head), overflow="fold", min_width=smallest)
             width += smallest
@@ -116,7 +134,9 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
         grid.add_row(*map(Text, row), style="red" if any("✗" in text for text in row) else "")
     console.print(grid, highlight=False)
     if left_out and len(texts):
-        console.print(f"not shown: {', '.join(left_out)}", style="dim", highlight=False, markup=False)
+        console.print(
+            f"not shown: {', '.join(left_out)}", style="dim", highlight=False, markup=False
+        )
 
 
 def write_files(
@@ -137,5 +157,7 @@ def write_files(
         if path.suffix == ".csv":
             write_text(path, content.to_csv(index=False))
         else:
-            write_text(path, content if isinstance(content, str) else json.dumps(content, indent=1) + "\n")
+            write_text(
+                path, content if isinstance(content, str) else json.dumps(content, indent=1) + "\n"
+            )
     return folder

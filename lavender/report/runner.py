@@ -26,7 +26,14 @@ from lavender.base.lazy_import import pandas as pd
 from lavender.diagnostics.motion_error import motion_error
 from lavender.problem import Problem, check_problem
 from lavender.report import machine
-from lavender.report.cases import Item, Source, describe_case, hash_problem, resolve_item, resolve_sources
+from lavender.report.cases import (
+    Item,
+    Source,
+    describe_case,
+    hash_problem,
+    resolve_item,
+    resolve_sources,
+)
 from lavender.report.store import (
     CASE_COLUMNS,
     CASE_DETAILS,
@@ -81,7 +88,9 @@ def carry_impulses(before: Problem, impulse: FloatArray, problem: Problem) -> Fl
     """Return the start of `problem` (m,) [N s] from the impulses of the previous step, if they can be assigned."""
     check_problem(problem)
     if not isinstance(before, Problem):
-        raise InputError(f"before is a {type(before).__name__}; the problem of the previous step is needed")
+        raise InputError(
+            f"before is a {type(before).__name__}; the problem of the previous step is needed"
+        )
     start = problem._carry(before, before.make_start(impulse))[0]
     return problem.start() if start is None else start
 
@@ -104,10 +113,17 @@ def select_solver_names(names: str | Sequence[str] | None) -> list[str]:
 
 
 def run(
-    cases: Source | Iterable[Source] = (), solvers: str | Sequence[str] | None = None, plan: Plan | None = None,
-    store: Store | str | Path | None = None, *, workers: int = 1, backend: str = "loky",
-    watch: Watch | None = None, into: list[Row] | None = None, reuse: bool = True,
-) -> pd.DataFrame:  # fmt: skip
+    cases: Source | Iterable[Source] = (),
+    solvers: str | Sequence[str] | None = None,
+    plan: Plan | None = None,
+    store: Store | str | Path | None = None,
+    *,
+    workers: int = 1,
+    backend: str = "loky",
+    watch: Watch | None = None,
+    into: list[Row] | None = None,
+    reuse: bool = True,
+) -> pd.DataFrame:
     """Measure every solver on every case that it accepts.
 
     Parameters
@@ -159,12 +175,16 @@ def run(
         items = [replace(item, sequence="", step=-1) for item in items]
     names = select_solver_names(solvers)
     specs = [registry.specs()[name] for name in names]
-    packages = {package for spec in specs for package in (*spec.requires, spec.distribution) if package}
+    packages = {
+        package for spec in specs for package in (*spec.requires, spec.distribution) if package
+    }
     this = machine.describe_run({**asdict(plan), "solvers": names}, packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
     # The limit of threads covers the description of cases, which uses BLAS.
     opened: contextlib.AbstractContextManager[Store | None]
-    opened = contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
+    opened = (
+        contextlib.nullcontext(store) if store is None or isinstance(store, Store) else Store(store)
+    )
     with cluster, opened as kept, limit_to_one_thread():
         runner = Runner(this, plan, names, kept, watch, reuse)
         runner.out = runner.out if into is None else into
@@ -176,9 +196,14 @@ class Runner:
     """Measures pairs of case and solver. Stored measurements are reused, new ones stored as soon as they are made."""
 
     def __init__(
-        self, this: Row, plan: Plan, names: list[str], store: Store | None = None,
-        watch: Watch | None = None, reuse: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        this: Row,
+        plan: Plan,
+        names: list[str],
+        store: Store | None = None,
+        watch: Watch | None = None,
+        reuse: bool = True,
+    ) -> None:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch = store, watch
         self.specs = registry.specs()
@@ -187,10 +212,20 @@ class Runner:
         self.known: dict[Any, Row] = {}
         self.described: dict[str, Row] = {}  # Many cases take longer to describe than to load.
         if store is not None and reuse:
-            stored = store.lines[store.lines["run"] == this["run"]] if "run" in store.lines else store.lines
+            stored = (
+                store.lines[store.lines["run"] == this["run"]]
+                if "run" in store.lines
+                else store.lines
+            )
             for row in convert_columns(stored, "run", RUN_COLUMNS).to_dict("records"):
-                self.known[get_key(row)] = {"kind": "run", **row, "times": list(map(float, row["times"]))}
-            for row in convert_columns(stored, "case", CASE_DETAILS | CASE_COLUMNS).to_dict("records"):
+                self.known[get_key(row)] = {
+                    "kind": "run",
+                    **row,
+                    "times": list(map(float, row["times"])),
+                }
+            for row in convert_columns(stored, "case", CASE_DETAILS | CASE_COLUMNS).to_dict(
+                "records"
+            ):
                 self.described[row["case"]] = {"kind": "case", **row}
 
     def add_row(self, row: Row) -> None:
@@ -204,7 +239,9 @@ class Runner:
         pair = {"case": case, "solver": solver, "sequence": sequence}
         self.add_row({"kind": "skip", "run": self.this["run"], **pair, "reason": reason})
 
-    def report_progress(self, case: str, solver: str, row: Row | None = None, reused: bool = False) -> None:
+    def report_progress(
+        self, case: str, solver: str, row: Row | None = None, reused: bool = False
+    ) -> None:
         """Call `watch` with the number of pairs that are done."""
         if self.watch is not None:
             self.watch(Event(self.done, self.total, case, solver, row, reused, phase="measuring"))
@@ -229,19 +266,32 @@ class Runner:
 
     def distribute_pairs(self, items: list[Item], workers: int, backend: str) -> None:
         """Measure the pairs of a campaign with workers, and store the rows of each pair when a worker returns them."""
-        local = tuple(spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution))
+        local = tuple(
+            spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.distribution)
+        )
         known: dict[tuple[str, str], list[Row]] = {}
         for row in self.known.values():
             known.setdefault((row["case"], row["solver"]), []).append(row)
         # A worker reads a name or path itself: machines of a cluster share files and suite.
         calls = [
-            (number, item.name, item.source if item.in_memory is None else replace(item.in_memory, copy=False), name,
-             self.described.get(item.name), known.get((item.name, name), []), self.this, self.plan, local)
+            (
+                number,
+                item.name,
+                item.source if item.in_memory is None else replace(item.in_memory, copy=False),
+                name,
+                self.described.get(item.name),
+                known.get((item.name, name), []),
+                self.this,
+                self.plan,
+                local,
+            )
             for number, (item, name) in enumerate(product(items, self.names))
-        ]  # fmt: skip
+        ]
         rows: dict[int, list[Row]] = {}
         try:
-            for number, new in map_unordered(measure_in_worker, calls, workers, backend) if calls else ():
+            for number, new in (
+                map_unordered(measure_in_worker, calls, workers, backend) if calls else ()
+            ):
                 for row in new:
                     is_stored = row["kind"] == "run" and get_key(row) in self.known
                     if self.store is not None and not is_stored:
@@ -292,7 +342,9 @@ class Runner:
     def measure_sequence(self, items: list[Item]) -> None:
         """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
         steps = [(item, case) for item in items if (case := self.load_case(item)) is not None]
-        identity = hashlib.sha256("".join(case["sha"] for _, case in steps).encode()).hexdigest()[:16]
+        identity = hashlib.sha256("".join(case["sha"] for _, case in steps).encode()).hexdigest()[
+            :16
+        ]
         loaded = [item for item, _ in steps]
         cases = [{**case, "identity": identity} for _, case in steps]
         for case in cases:
@@ -303,19 +355,27 @@ class Runner:
             if spec is not None:
                 for target in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    tasks = [make_task(case, spec.name, *target, self.plan.time_limit) for case in cases]
+                    tasks = [
+                        make_task(case, spec.name, *target, self.plan.time_limit) for case in cases
+                    ]
                     self.measure_pass(loaded, spec, tasks, repeats)
             self.done += len(items)
 
-    def measure_pass(self, problems: list[Item], spec: SolverSpec, tasks: list[Row], repeats: int) -> None:
+    def measure_pass(
+        self, problems: list[Item], spec: SolverSpec, tasks: list[Row], repeats: int
+    ) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
-        call, stride = tasks[0], -(-len(tasks) // MAX_MOTION_STEPS)
-        limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
+        call = tasks[0]
+        stride = -(-len(tasks) // MAX_MOTION_STEPS)
+        limit = self.plan.sequence_time_limit
+        spent = 0.0
+        made = 0
         for task in tasks:
             row = self.known.get(get_key(task))
             if row is None or spent > limit:
                 break
-            spent, made = spent + _get_elapsed_time(row), made + 1
+            spent = spent + _get_elapsed_time(row)
+            made = made + 1
             self.out.append(row)
             self.report_progress(task["case"], spec.name, row, True)
         before: tuple[Problem, FloatArray] | None = None
@@ -325,12 +385,16 @@ class Runner:
                 before = self.measure_step(item, task, spec, before)[1]
         while made < len(tasks) and spent <= limit:
             longest = max(row["times"], default=math.inf) if row else math.inf
-            how = {"repeats": repeats, "is_guarded": longest >= UNGUARDED_TIME_RATIO * self.plan.time_limit}
+            how = {
+                "repeats": repeats,
+                "is_guarded": longest >= UNGUARDED_TIME_RATIO * self.plan.time_limit,
+            }
             item, task = problems[made], tasks[made]
             row, before = self.measure_step(item, task, spec, before, made % stride == 0, **how)
             self.add_row(row)
             self.report_progress(row["case"], spec.name, row)
-            spent, made = spent + _get_elapsed_time(row), made + 1
+            spent = spent + _get_elapsed_time(row)
+            made = made + 1
         if made < len(tasks):
             target = describe_target(call["mode"], call["tol"], call["max_iter"])
             took = f"which took more than the pass limit of {limit:.3g} s together (--sequence-time-limit)"
@@ -338,16 +402,22 @@ class Runner:
             self.add_skip(f"{problems[0].sequence}, {target}, {call['start']}", spec.name, reason)
 
     def measure_step(
-        self, item: Item, task: Row, spec: SolverSpec, before: tuple[Problem, FloatArray] | None,
-        with_motion: bool = False, **how: Any,
-    ) -> tuple[Row, tuple[Problem, FloatArray] | None]:  # fmt: skip
+        self,
+        item: Item,
+        task: Row,
+        spec: SolverSpec,
+        before: tuple[Problem, FloatArray] | None,
+        with_motion: bool = False,
+        **how: Any,
+    ) -> tuple[Row, tuple[Problem, FloatArray] | None]:
         """Measure one step; if its task has start "carried", start from the previous problem and impulses.
 
         In a pass of a fixed number of sweeps, the first recorded step starts from the guess in its file, and the second
         step from the engine's answer to the first one, if the file has one: a recording may begin when impulses have
         been carried for long. `with_motion` adds the error of the motion, which is not timed.
         """
-        start, problem = None, item.problem
+        start = None
+        problem = item.problem
         is_carried, is_budget = task["start"] == "carried", task["mode"] == "budget"
         is_first = is_carried and is_budget and before is None
         if is_carried:
@@ -367,7 +437,9 @@ class Runner:
             impulse = answer if np.isfinite(answer).all() else impulse
         return row, None if impulse is None else (problem, impulse)
 
-    def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
+    def select_solver(
+        self, case: str, name: str, items: Sequence[Item | Problem]
+    ) -> SolverSpec | None:
         """Return the solver to run for `name`.
 
         If it refuses a case, return its bounded variant, or record a note and return None.
@@ -409,14 +481,16 @@ class Runner:
 
     def measure_task(
         self, problem: Problem, task: Row, spec: SolverSpec, impulse: Any, **how: Any
-    ) -> tuple[Row, Any]:  # fmt: skip
+    ) -> tuple[Row, Any]:
         """Solve a task; return its row and impulses (m,) [N s]."""
         if self.plan.campaign and not (spec.external or spec.requires or spec.distribution):
             task = task | {"time_limit": math.inf}
         row, found = measure_task(problem, task, impulse, **how)
         if found is not None:
             row["solution_hash"] = hashlib.sha256(found.tobytes()).hexdigest()[:16]
-        if self.plan.campaign:  # Without times, and with the plan's limit, rows are equal on all machines.
+        if (
+            self.plan.campaign
+        ):  # Without times, and with the plan's limit, rows are equal on all machines.
             same = dict.fromkeys(NO_TIMES, math.nan) | {"time_limit": self.plan.time_limit}
             row = add_times(row | same, ())
         return row, found
@@ -450,9 +524,16 @@ _last_case: tuple[Any, Item | None, Row | None] = None, None, None
 
 
 def measure_in_worker(
-    number: int, name: str, source: str | Problem, solver: str, described: Row | None, known: list[Row], this: Row,
-    plan: Plan, local: tuple[SolverSpec, ...],
-) -> tuple[int, list[Row]]:  # fmt: skip
+    number: int,
+    name: str,
+    source: str | Problem,
+    solver: str,
+    described: Row | None,
+    known: list[Row],
+    this: Row,
+    plan: Plan,
+    local: tuple[SolverSpec, ...],
+) -> tuple[int, list[Row]]:
     """Measure a pair of case and solver in a worker, on one thread as pairs run in parallel.
 
     `source` is a name or path that the worker resolves itself, or the problem; `described` and `known` are stored rows

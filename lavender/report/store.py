@@ -33,24 +33,70 @@ ERROR = "ERROR"  # Status of a run whose solver raised an exception; other runs 
 KEY = ("run", "case", "sha", "solver", "start", "mode", "tol", "max_iter", "time_limit")
 #: Columns of runs with their defaults, which are the values of a run without an answer and determine the types.
 RUN_COLUMNS: Row = {
-    "run": "", "case": "", "sha": "", "solver": "", "start": "cold", "mode": "tol", "tol": math.nan, "max_iter": 0,
-    "time_limit": math.nan, "step": -1, "status": "", "relative": math.inf,
-    "error_energy": math.inf, "velocity": math.inf, "roundoff_floor": math.nan, "energy_change": math.nan,
-    "energy_gain": math.nan, "motion_error": math.nan, "worst_row": -1, "worst_name": "", "success": False,
-    "claims": False, "claim_check": CONFIRMED, "status_conflict": "", "iterations": 0, "work": "{}", "form": "",
-    "message": "", "time": math.nan, "time_median": math.nan, "repetitions": 0, "carry_time": math.nan,
-    "setup_time": math.nan, "solve_time": math.nan, "calibration_time": math.nan, "load": math.nan,
-    "solution_hash": "", "times": (),
-}  # fmt: skip
+    "run": "",
+    "case": "",
+    "sha": "",
+    "solver": "",
+    "start": "cold",
+    "mode": "tol",
+    "tol": math.nan,
+    "max_iter": 0,
+    "time_limit": math.nan,
+    "step": -1,
+    "status": "",
+    "relative": math.inf,
+    "error_energy": math.inf,
+    "velocity": math.inf,
+    "roundoff_floor": math.nan,
+    "energy_change": math.nan,
+    "energy_gain": math.nan,
+    "motion_error": math.nan,
+    "worst_row": -1,
+    "worst_name": "",
+    "success": False,
+    "claims": False,
+    "claim_check": CONFIRMED,
+    "status_conflict": "",
+    "iterations": 0,
+    "work": "{}",
+    "form": "",
+    "message": "",
+    "time": math.nan,
+    "time_median": math.nan,
+    "repetitions": 0,
+    "carry_time": math.nan,
+    "setup_time": math.nan,
+    "solve_time": math.nan,
+    "calibration_time": math.nan,
+    "load": math.nan,
+    "solution_hash": "",
+    "times": (),
+}
 #: Columns of cases with their defaults. The second line of names is not repeated in the rows of runs.
 CASE_COLUMNS: Row = {
-    "law": "", "rows": 0, "blocks": 0, "islands": 0, "contacts": 0, "mass_ratio": math.nan, "structure": "",
-    "symmetric": True, "sequence": "", "nothing_to_do": False, "variables": 0,
-}  # fmt: skip
+    "law": "",
+    "rows": 0,
+    "blocks": 0,
+    "islands": 0,
+    "contacts": 0,
+    "mass_ratio": math.nan,
+    "structure": "",
+    "symmetric": True,
+    "sequence": "",
+    "nothing_to_do": False,
+    "variables": 0,
+}
 CASE_DETAILS: Row = {
-    "run": "", "case": "", "sha": "", "step": -1, "source": "", "identity": "", "guess": "", "stored": math.nan,
+    "run": "",
+    "case": "",
+    "sha": "",
+    "step": -1,
+    "source": "",
+    "identity": "",
+    "guess": "",
+    "stored": math.nan,
     "diagnostics": (),
-}  # fmt: skip
+}
 SKIP_COLUMNS: Row = {"run": "", "case": "", "solver": "", "reason": "", "sequence": ""}
 MACHINE_COLUMNS = ("started", "cpu", "cores", "threads", "platform", "python", "lavender")
 
@@ -160,19 +206,27 @@ def read(path: str | Path) -> pd.DataFrame:
     # Editors of some systems begin a file, and so each part of joined files, with a byte order mark.
     whole = content[: content.rfind(b"\n") + 1].replace(b"\xef\xbb\xbf", b"")
     try:
-        with warnings.catch_warnings():  # Recent versions of pandas need and know no `convert_dates`.
+        with (
+            warnings.catch_warnings()
+        ):  # Recent versions of pandas need and know no `convert_dates`.
             warnings.simplefilter("ignore")
             lines = pd.read_json(
-                io.BytesIO(whole), lines=True, dtype=False, convert_dates=False, precise_float=True,
+                io.BytesIO(whole),
+                lines=True,
+                dtype=False,
+                convert_dates=False,
+                precise_float=True,
                 encoding_errors="replace",
-            )  # fmt: skip
+            )
         if len(lines) and not ("kind" in lines and lines["kind"].isin(KINDS).all()):
             raise ValueError(f"each line needs a kind, one of {', '.join(KINDS)}")
         lines = lines if len(lines) else make_lines([])
         lines.attrs = {"source": str(path), "dropped": int(dropped > 0)}
         select_runs(lines)  # Raises an error if a column has values of another type.
     except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path} is not a records.jsonl that `lavender report` wrote: {error}") from None
+        raise InputError(
+            f"{path} is not a records.jsonl that `lavender report` wrote: {error}"
+        ) from None
     return lines
 
 
@@ -181,11 +235,16 @@ def read(path: str | Path) -> pd.DataFrame:
 
 def convert_columns(lines: pd.DataFrame, kind: str, columns: Row) -> pd.DataFrame:
     """Return the lines of one kind with these columns, in the types of the defaults, which replace missing values."""
-    some, converted = lines[lines["kind"] == kind], {}
+    some = lines[lines["kind"] == kind]
+    converted = {}
     for name, default in columns.items():
         values = some[name] if name in some else pd.Series(None, index=some.index, dtype=object)
         if not (known := values.notna()).all():
-            values = values.astype(object).where(known, None).map(lambda x, y=default: y if x is None else x)
+            values = (
+                values.astype(object)
+                .where(known, None)
+                .map(lambda x, y=default: y if x is None else x)
+            )
         if isinstance(default, tuple):
             values = values.map(list)
         elif isinstance(default, str):
@@ -204,7 +263,11 @@ def select_runs(lines: pd.DataFrame) -> pd.DataFrame:
     InputError
         No line describes the case or the machine of a run.
     """
-    runs = convert_columns(lines, "run", RUN_COLUMNS).drop(columns="times").drop_duplicates(KEY, keep="last")
+    runs = (
+        convert_columns(lines, "run", RUN_COLUMNS)
+        .drop(columns="times")
+        .drop_duplicates(KEY, keep="last")
+    )
     cases, machines = select_cases(lines), select_machines(lines)
     described = convert_columns(lines, "case", {"case": ""})["case"].unique()
     for name, known in (("case", described), ("run", machines)):
@@ -217,9 +280,12 @@ def select_runs(lines: pd.DataFrame) -> pd.DataFrame:
     facts = {name: case.map(cases[name].to_dict()) for name in CASE_COLUMNS}
     for name in (*MACHINE_COLUMNS, "versions"):
         facts[name] = run.map({r: machine.get(name) for r, machine in machines.items()})
-    facts["versions"] = run.map({
-        r: ", ".join(f"{name} {v}" for name, v in machine["versions"].items()) for r, machine in machines.items()
-    })  # fmt: skip
+    facts["versions"] = run.map(
+        {
+            r: ", ".join(f"{name} {v}" for name, v in machine["versions"].items())
+            for r, machine in machines.items()
+        }
+    )
     runs = runs.assign(**facts).reset_index(drop=True)
     runs.loc[runs["law"] == "program", ["velocity", "error_energy"]] = math.nan
     texts = [name for name in facts if runs[name].dtype.kind not in "biuf"]
@@ -228,8 +294,12 @@ def select_runs(lines: pd.DataFrame) -> pd.DataFrame:
 
 def select_cases(lines: pd.DataFrame) -> pd.DataFrame:
     """Return the last description of each case, by its name; of two sequences with one name, the steps of the last."""
-    cases = convert_columns(lines, "case", CASE_DETAILS | CASE_COLUMNS).drop_duplicates("case", keep="last")
-    cases = cases.astype(dict.fromkeys(("case", "sequence", "identity", "source", "structure"), object))
+    cases = convert_columns(lines, "case", CASE_DETAILS | CASE_COLUMNS).drop_duplicates(
+        "case", keep="last"
+    )
+    cases = cases.astype(
+        dict.fromkeys(("case", "sequence", "identity", "source", "structure"), object)
+    )
     latest = cases.groupby("sequence")["identity"].last()
     cases = cases[(cases["identity"] == cases["sequence"].map(latest)) | (cases["sequence"] == "")]
     return cases.set_index("case", drop=False)
@@ -244,18 +314,35 @@ def select_skips(lines: pd.DataFrame) -> pd.DataFrame:
     skips = skips.drop_duplicates(["run", "case", "solver"], keep="last")
     loaded = convert_columns(lines, "case", {"run": "", "case": ""})
     last = dict(zip(zip(loaded["run"], loaded["case"], strict=True), loaded.index, strict=True))
-    is_open = [bool(r.solver) or last.get((r.run, r.case), -1) < r.Index for r in skips.itertuples()]
+    is_open = [
+        bool(r.solver) or last.get((r.run, r.case), -1) < r.Index for r in skips.itertuples()
+    ]
     return skips.loc[skips.index[np.array(is_open, bool)]].astype(object)
 
 
 def select_machines(lines: pd.DataFrame) -> dict[str, Row]:
     """Return the last description of each machine with its versions and plan, by its run, in order of time."""
     machines: dict[str, Row] = {}
-    defaults = {"run": "", "started": "", "lavender": "", "python": "", "platform": "", "cpu": "", "cores": 1,
-                "threads": 1, "load": math.nan, "whole": True}  # fmt: skip
-    texts = convert_columns(lines, "machine", defaults).astype(dict.fromkeys(("run", "cpu"), object))
+    defaults = {
+        "run": "",
+        "started": "",
+        "lavender": "",
+        "python": "",
+        "platform": "",
+        "cpu": "",
+        "cores": 1,
+        "threads": 1,
+        "load": math.nan,
+        "whole": True,
+    }
+    texts = convert_columns(lines, "machine", defaults).astype(
+        dict.fromkeys(("run", "cpu"), object)
+    )
     for i, row in zip(texts.index, texts.to_dict("records"), strict=True):
-        parts = {name: lines[name].get(i) if name in lines else {} for name in ("versions", "plan", "build")}
+        parts = {
+            name: lines[name].get(i) if name in lines else {}
+            for name in ("versions", "plan", "build")
+        }
         machines.pop(row["run"], None)
         machines[row["run"]] = {**row, **parts}
     return machines
@@ -268,5 +355,7 @@ def select_solvers(lines: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     names = list(names)
     for name in names:
         if name not in known:
-            raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
+            raise InputError(
+                f"no records of solver {name!r}; there are records of {', '.join(known)}"
+            )
     return lines[own.isna() | own.isin(["", *names])]

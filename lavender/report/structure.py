@@ -55,7 +55,8 @@ def classify_structure_and_count_islands(problem: Problem) -> tuple[tuple[str, .
     """Return the words of `classify_structure`, and the number of islands; 0 for a matrix that is not mechanical."""
     if problem.m == 0:
         return ("empty",), 0
-    features, islands = [], 0
+    features = []
+    islands = 0
     mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
     if mechanical:
         word, islands = _classify_coupling_graph(problem)
@@ -78,7 +79,9 @@ def _classify_coupling_graph(problem: Problem) -> tuple[str, int]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    n, i, j = _build_body_graph(problem) if problem.rows is not None else _build_block_graph(problem)
+    n, i, j = (
+        _build_body_graph(problem) if problem.rows is not None else _build_block_graph(problem)
+    )
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
     count, component = connected_components(graph, directed=False)
     count = int(count)
@@ -110,7 +113,8 @@ def _is_bilateral(problem: Problem) -> bool:
         has_free_row = np.diff(free_rows[c.ptr[: r.n_joints + 1]]) > 0
         low, high = np.sort(r.block_bodies, axis=1).astype(np.int64).T
         pairs = (low + 1) * (r.n_bodies + 1) + high
-        joints, bounded = pairs[: r.n_joints][has_free_row], pairs[: r.n_joints][~has_free_row]
+        joints = pairs[: r.n_joints][has_free_row]
+        bounded = pairs[: r.n_joints][~has_free_row]
         contacts = np.append(pairs[r.n_joints :], np.setdiff1d(bounded, joints))
         return len(np.unique(joints)) > len(np.unique(contacts))
     first = c.ptr[:-1][~c.is_contact]
@@ -118,7 +122,9 @@ def _is_bilateral(problem: Problem) -> bool:
     return bool(2 * free > c.n_blocks)
 
 
-Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # Number of nodes, and both ends of each edge.
+Edges = tuple[
+    int, NDArray[np.int64], NDArray[np.int64]
+]  # Number of nodes, and both ends of each edge.
 
 
 def _build_body_graph(problem: Problem) -> Edges:
@@ -146,7 +152,9 @@ def _build_block_graph(problem: Problem) -> Edges:
     graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(c.n_blocks, c.n_blocks))
     graph = sp.csr_array(graph + graph.T + sp.eye_array(c.n_blocks))
     graph.sort_indices()
-    patterns = [graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)]
+    patterns = [
+        graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)
+    ]
     count = Counter(patterns)
     groups: dict[bytes | int, int] = {}
     # More blocks with equal couplings than a pair of bodies has contacts mean a dense matrix: keep them separate.

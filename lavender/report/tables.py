@@ -58,11 +58,26 @@ MIN_NOISE, MAX_NOISE = 0.05, 0.25
 ANSWER_TEXTS = ("file", "verdict", "solver", "worst")
 ANSWER_NUMBERS = ("rows", "relative", "seconds", "velocity", "iterations")
 LEFT_OUT = "left out"  # The verdict on a step that could not be recorded.
-ENGINE_SWEEPS = ("sequential_impulses", "pgs")  # Methods of most engines, listed before other plain sweeps.
+ENGINE_SWEEPS = (
+    "sequential_impulses",
+    "pgs",
+)  # Methods of most engines, listed before other plain sweeps.
 MAX_TIES = 3  # A cell names up to this many solvers.
-PREFERRED_SOLVER = "auto"  # Listed first among equally good solvers, as its users need not choose a method.
-STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense", "redundant", "friction", "large mass ratio",
-                   "asymmetric")  # fmt: skip
+PREFERRED_SOLVER = (
+    "auto"  # Listed first among equally good solvers, as its users need not choose a method.
+)
+STRUCTURE_ORDER = (
+    "separate",
+    "chain",
+    "mesh",
+    "stack",
+    "pile",
+    "dense",
+    "redundant",
+    "friction",
+    "large mass ratio",
+    "asymmetric",
+)
 
 
 # -- ranking -----------------------------------------------------------------------------------------------
@@ -87,7 +102,9 @@ def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
     words = single.assign(word=single["structure"].str.split(", ")).explode("word")
     names: dict[tuple[str, ...], list[str]] = {}
     order = {word: i for i, word in enumerate(STRUCTURE_ORDER)}
-    for word, some in sorted(words.groupby("word"), key=lambda x: (order.get(x[0], len(order)), x[0])):
+    for word, some in sorted(
+        words.groupby("word"), key=lambda x: (order.get(x[0], len(order)), x[0])
+    ):
         laws = some["law"].value_counts().index
         for law in laws:
             members = tuple(some.loc[some["law"] == law, "case"])
@@ -126,23 +143,41 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
     names = list(times.columns) if cases is None else [case for case in cases if case in times]
     accepted = report.accepted[names]
     times = times.loc[accepted.any(axis=1), names]
-    false = report.frame[report.frame["case"].isin(names) & (report.frame["claim_check"] == CONTRADICTED)]
-    ranking = pd.DataFrame({
-        "solved": times.notna().sum(axis=1), "tried": accepted.loc[times.index].sum(axis=1), "cases": len(names),
-        "mean": compute_mean(times.clip(upper=report.time_limit).fillna(report.time_limit), axis=1),
-        "worst": times.max(axis=1), "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
-        "false": false["solver"].astype(str).value_counts().reindex(times.index).fillna(0).astype(int),
-        "noise": report.noise.reindex(times.index),
-    })  # fmt: skip
+    false = report.frame[
+        report.frame["case"].isin(names) & (report.frame["claim_check"] == CONTRADICTED)
+    ]
+    ranking = pd.DataFrame(
+        {
+            "solved": times.notna().sum(axis=1),
+            "tried": accepted.loc[times.index].sum(axis=1),
+            "cases": len(names),
+            "mean": compute_mean(
+                times.clip(upper=report.time_limit).fillna(report.time_limit), axis=1
+            ),
+            "worst": times.max(axis=1),
+            "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
+            "false": false["solver"]
+            .astype(str)
+            .value_counts()
+            .reindex(times.index)
+            .fillna(0)
+            .astype(int),
+            "noise": report.noise.reindex(times.index),
+        }
+    )
     ranking = ranking.assign(liar=ranking["false"] > 0)
-    ranking = ranking.sort_values(["liar", "solved", "mean"], ascending=[True, False, True], kind="stable")
+    ranking = ranking.sort_values(
+        ["liar", "solved", "mean"], ascending=[True, False, True], kind="stable"
+    )
     # Results tie with the first if they solve as many cases, in mean times that differ within noise.
     first = ranking.head(1).squeeze()
     noise = 1.0 + np.maximum(ranking["noise"], first["noise"])
     is_near = ranking["mean"].between(first["mean"] / noise, first["mean"] * noise)
     is_equal = (ranking["solved"] == first["solved"]) & (ranking["liar"] <= first["liar"])
     tie = (is_near & is_equal & (ranking["solved"] > 0)).to_numpy()
-    ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1))).drop(columns="liar")
+    ranking = ranking.assign(tie=tie, place=np.where(tie, 1, np.arange(1, len(tie) + 1))).drop(
+        columns="liar"
+    )
     is_first = ranking["tie"] & (ranking.index == PREFERRED_SOLVER)
     return ranking.iloc[np.argsort(np.where(is_first, 0, np.where(tie, 1, 2)), kind="stable")]
 
@@ -156,7 +191,9 @@ def is_plug_in(solver: str) -> bool:
 def format_size(case: Any) -> str:
     """Return the size of a case from its facts: "40 rows", of a program also the number of its variables."""
     rows = format_count(int(case["rows"]), "row")
-    return f"{format_count(int(case['variables']), 'variable')}, {rows}" if case["variables"] else rows
+    return (
+        f"{format_count(int(case['variables']), 'variable')}, {rows}" if case["variables"] else rows
+    )
 
 
 # -- answers of engines ------------------------------------------------------------------------------------
@@ -179,10 +216,14 @@ def read_engine_answers(sources: Sequence[str], lines: Frame) -> Frame:
     files = cases[cases["source"].astype(str).str.endswith(SUFFIXES)]
     stored = files[files["stored"].notna() & (files["sequence"] != "")]
     answers = []
-    for folder in dict.fromkeys([*map(Path, sources), *(Path(str(s)).parent for s in files["source"])]):
+    for folder in dict.fromkeys(
+        [*map(Path, sources), *(Path(str(s)).parent for s in files["source"])]
+    ):
         own = [Path(s).name for s in stored["source"].astype(str) if Path(s).parent == folder]
         entries = read_engine_lines(folder) or [{"file": name, "solver": "engine"} for name in own]
-        answers += [row for entry in entries if (row := _complete_answer(folder, entry)) is not None]
+        answers += [
+            row for entry in entries if (row := _complete_answer(folder, entry)) is not None
+        ]
     return _make_answers(answers)
 
 
@@ -208,18 +249,26 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
             threshold = float(answer.get("threshold", DEFAULT_THRESHOLD))
             answer = answer | describe_answer(io.load(path), impulse, threshold)
     try:
-        numbers = {x: math.nan if answer.get(x) is None else float(answer[x]) for x in ANSWER_NUMBERS}
+        numbers = {
+            x: math.nan if answer.get(x) is None else float(answer[x]) for x in ANSWER_NUMBERS
+        }
     except (ValueError, TypeError):
         return None
     texts = {"folder": str(folder), **{name: str(answer.get(name, "")) for name in ANSWER_TEXTS}}
     is_judged = {"relative", "rows"} <= answer.keys()
-    return {name: escape_unprintable(text) for name, text in texts.items()} | numbers if is_judged else None
+    return (
+        {name: escape_unprintable(text) for name, text in texts.items()} | numbers
+        if is_judged
+        else None
+    )
 
 
 def read_own_answers(report: Contents) -> Frame:
     """Return the engine's answers to the cases of a report, with `case` and `step` of each."""
     sources = {str(Path(s)): case for case, s in report.cases["source"].astype(str).items()}
-    answers = report.engines[report.engines.index.isin(list(sources)) & report.engines["velocity"].notna()]
+    answers = report.engines[
+        report.engines.index.isin(list(sources)) & report.engines["velocity"].notna()
+    ]
     cases = answers.index.map(sources)
     return answers.assign(case=cases, step=report.cases.loc[cases, "step"].to_numpy())
 
@@ -296,10 +345,17 @@ class Contents:
         frame = self.runs[is_newest & (self.runs["sha"].astype(str) == sha)]
         if not (self.is_stopped and len(frame)):
             return frame
-        last, solvers = frame.iloc[-1], set(self.machine["plan"].get("solvers", ()))
-        is_running = (frame["sequence"] == (last["sequence"] or None)) & (frame["solver"] == last["solver"])
-        skips, sequences = self.skips[self.skips["run"] == self.machine["run"]], self.cases["sequence"]
-        done = {case: set(some) for case, some in frame[~is_running].groupby("case", observed=True)["solver"]}
+        last = frame.iloc[-1]
+        solvers = set(self.machine["plan"].get("solvers", ()))
+        is_running = (frame["sequence"] == (last["sequence"] or None)) & (
+            frame["solver"] == last["solver"]
+        )
+        skips = self.skips[self.skips["run"] == self.machine["run"]]
+        sequences = self.cases["sequence"]
+        done = {
+            case: set(some)
+            for case, some in frame[~is_running].groupby("case", observed=True)["solver"]
+        }
         for name, solver in zip(skips["case"], skips["solver"], strict=True):
             for case in [name] if name in self.cases.index else self.cases.index[sequences == name]:
                 done.setdefault(str(case), set()).add(solver)
@@ -324,17 +380,28 @@ class Contents:
         mode = "tol" if (self.frame["mode"] == "tol").any() else "budget"
         runs = select_starts(self.frame[self.frame["mode"] == mode])
         cases = runs.drop_duplicates("case")
-        answers = self.engines.reindex([str(Path(s)) for s in self.cases.loc[cases["case"], "source"]])
+        answers = self.engines.reindex(
+            [str(Path(s)) for s in self.cases.loc[cases["case"], "source"]]
+        )
         if self.is_campaign or not len(cases) or not (answers["seconds"] >= 0.0).all():
             return runs
         own = cases.assign(
-            solver=ENGINE_NAME, tol=0.0, claims=False, claim_check=CONFIRMED, status_conflict="", form="",
-            status=answers["verdict"].to_numpy(), message="", start=np.where(cases["step"] < 0, "cold", "carried"),
-            time=answers["seconds"].to_numpy(), time_median=answers["seconds"].to_numpy(),
+            solver=ENGINE_NAME,
+            tol=0.0,
+            claims=False,
+            claim_check=CONFIRMED,
+            status_conflict="",
+            form="",
+            status=answers["verdict"].to_numpy(),
+            message="",
+            start=np.where(cases["step"] < 0, "cold", "carried"),
+            time=answers["seconds"].to_numpy(),
+            time_median=answers["seconds"].to_numpy(),
             iterations=answers["iterations"].fillna(0).astype(int).to_numpy(),
-            relative=answers["relative"].to_numpy(), velocity=answers["velocity"].to_numpy(),
+            relative=answers["relative"].to_numpy(),
+            velocity=answers["velocity"].to_numpy(),
             worst_name=answers["worst"].to_numpy(),
-        )  # fmt: skip
+        )
         categories = [name for name in runs if runs[name].dtype == "category"]
         return pd.concat([runs.astype(dict.fromkeys(categories, object)), own])
 
@@ -364,16 +431,21 @@ class Contents:
     def noise(self) -> pd.Series[float]:
         """Noise of each solver's times, relative to its times: twice the spread of its repetitions, within bounds."""
         runs = self.ranked_runs
-        ratio = (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"].astype(str)).median()
+        ratio = (
+            (runs["time_median"] / runs["time"] - 1.0).groupby(runs["solver"].astype(str)).median()
+        )
         return (2.0 * ratio).clip(MIN_NOISE, MAX_NOISE).fillna(MIN_NOISE)
 
     def get_times(self, tolerance: float) -> Frame:
         """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
         if tolerance not in self._times:
             runs = self.ranked_runs
-            reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna({"time": 0.0})
+            reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna(
+                {"time": 0.0}
+            )
             times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
-            solvers, cases = sorted(map(str, runs["solver"].unique())), list(runs["case"].unique())
+            solvers = sorted(map(str, runs["solver"].unique()))
+            cases = list(runs["case"].unique())
             self._times[tolerance] = times.reindex(index=solvers, columns=cases)
         return self._times[tolerance]
 
@@ -408,7 +480,9 @@ class Contents:
     def busy(self) -> str:
         """A sentence if other processes used the processors during the measurement; else empty."""
         loads = [None if x != x else float(x) for x in self.frame["load"]]
-        return machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0])) if len(loads) else ""
+        return (
+            machine.make_busy_warning(loads, int(self.frame["cores"].iloc[0])) if len(loads) else ""
+        )
 
 
 # -- tables ------------------------------------------------------------------------------------------------
@@ -417,10 +491,14 @@ class Contents:
 def tabulate_solvers(report: Contents) -> Frame:
     """Tabulate the solvers in their ranking: solved and accepted cases, and the mean time to each tolerance."""
     ranking = rank_solvers(report, report.tolerance, report.subject)
-    table = pd.DataFrame({
-        "solver": ranking.index.astype(str), "solved": ranking["solved"].array, "accepted": ranking["tried"].array,
-        "cases": ranking["cases"].array,
-    })  # fmt: skip
+    table = pd.DataFrame(
+        {
+            "solver": ranking.index.astype(str),
+            "solved": ranking["solved"].array,
+            "accepted": ranking["tried"].array,
+            "cases": ranking["cases"].array,
+        }
+    )
     if not report.is_campaign:
         for tolerance in report.tolerances:
             means = rank_solvers(report, tolerance, report.subject)["mean"].reindex(ranking.index)
@@ -457,14 +535,22 @@ def tabulate_runs(report: Contents) -> Frame:
     table.columns = ["smallest residual [-]", "velocity error [m/s]", "floor [-]"]
     for tolerance in () if report.is_campaign else report.tolerances:
         target = f"to {format_tolerance(tolerance)}"
-        reached = to_tolerance[to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance].sort_values("time")
+        reached = to_tolerance[
+            to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance
+        ].sort_values("time")
         first = reached.drop_duplicates(keys).set_index(keys).reindex(table.index)
         table.insert(table.shape[1] - 3, f"{target} [s]", first["time"])
         table.insert(table.shape[1] - 3, f"{target}, median [s]", first["time_median"])
-    table = table.join(to_tolerance.groupby(keys)[["status", "form", "iterations", "worst_name"]].last())
-    missed = select_failures(report).astype(dict.fromkeys((*keys, "status_conflict", "message"), str))
+    table = table.join(
+        to_tolerance.groupby(keys)[["status", "form", "iterations", "worst_name"]].last()
+    )
+    missed = select_failures(report).astype(
+        dict.fromkeys((*keys, "status_conflict", "message"), str)
+    )
     conflict = missed["status_conflict"]
-    missed = missed.assign(reason=np.where(conflict != "", "✗ " + conflict + ". ", "") + missed["message"])
+    missed = missed.assign(
+        reason=np.where(conflict != "", "✗ " + conflict + ". ", "") + missed["message"]
+    )
     reasons = missed[missed["reason"] != ""].groupby(keys)["reason"].last()
     table["reason of a failure"] = reasons.reindex(table.index).fillna("")
     table = table.reset_index().rename(columns={"worst_name": "worst row"})
@@ -489,14 +575,17 @@ def tabulate_structures(report: Contents) -> Frame:
     A solver is named for a time if it serves at least `SERVED_QUANTILE` of the cases, with the smallest residual at
     this quantile; solvers within `RESIDUAL_NOISE_FACTOR` of it tie.
     """
-    rows, runs = [], select_starts(report.frame)
+    rows = []
+    runs = select_starts(report.frame)
     for name, cases in report.structures.items():
         row: Row = {"structure": name, "cases": len(cases)}
         sizes = report.cases.loc[cases, "rows"]
         row["rows"] = f"{sizes.min()}" + (f" to {sizes.max()}" if sizes.max() > sizes.min() else "")
         for tolerance in report.tolerances:
-            ranking, target = rank_solvers(report, tolerance, cases), f"to {format_tolerance(tolerance)}"
-            ties, first = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES], ranking.head(1)
+            ranking = rank_solvers(report, tolerance, cases)
+            target = f"to {format_tolerance(tolerance)}"
+            ties = list(map(str, ranking.index[ranking["tie"]]))[:MAX_TIES]
+            first = ranking.head(1)
             row[target] = " ≈ ".join(ties) or "none"
             if ties and (solved := first["solved"].iloc[0]) < len(cases):
                 row[target] = row[target].replace(ties[0], f"{ties[0]} ({solved}/{len(cases)})", 1)
@@ -507,7 +596,9 @@ def tabulate_structures(report: Contents) -> Frame:
             left = left.reindex(columns=cases).fillna(1.0)
             left = left[(left <= SERVED_RESIDUAL).mean(axis=1) >= SERVED_QUANTILE]
             # Between two infinite residuals, the interpolated quantile is nan.
-            score = left.quantile(SERVED_QUANTILE, axis=1).fillna(math.inf).sort_values(kind="stable")
+            score = (
+                left.quantile(SERVED_QUANTILE, axis=1).fillna(math.inf).sort_values(kind="stable")
+            )
             near = map(str, score.index[score <= RESIDUAL_NOISE_FACTOR * score.min()])
             names = sorted(near, key=lambda name: name != PREFERRED_SOLVER)
             row[f"in {format_seconds(t)}"] = " ≈ ".join(names[:MAX_TIES]) or "none"
@@ -521,21 +612,27 @@ def tabulate_costs(report: Contents) -> Frame:
     The exponent is fitted to the logarithms of the cases that a solver solves; the scatter is the typical factor
     between a case and the fit.
     """
-    times, rows_of = report.get_times(report.tolerance), report.cases["rows"].to_dict()
+    times = report.get_times(report.tolerance)
+    rows_of = report.cases["rows"].to_dict()
     rows = []
     for solver, own in times.iterrows():
         t = own[own > 0.0]
         n = np.array([rows_of[c] for c in t.index], float)
         if len(t) < MIN_FIT_CASES or n.min() <= 0.0 or n.max() < MIN_FIT_SIZE_RATIO * n.min():
             continue
-        x, y = np.log(n), np.log(t.to_numpy(float))
+        x = np.log(n)
+        y = np.log(t.to_numpy(float))
         exponent, constant = np.polyfit(x, y, 1)
-        rows.append({
-            "solver": solver, "cases": len(t), "rows": f"{n.min():.0f} to {n.max():.0f}",
-            "exponent of rows": round(float(exponent), 2),
-            "fit at 1000 rows [s]": math.exp(constant + exponent * math.log(1000.0)),
-            "scatter [factor]": round(float(np.exp(np.std(y - exponent * x - constant))), 2),
-        })  # fmt: skip
+        rows.append(
+            {
+                "solver": solver,
+                "cases": len(t),
+                "rows": f"{n.min():.0f} to {n.max():.0f}",
+                "exponent of rows": round(float(exponent), 2),
+                "fit at 1000 rows [s]": math.exp(constant + exponent * math.log(1000.0)),
+                "scatter [factor]": round(float(np.exp(np.std(y - exponent * x - constant))), 2),
+            }
+        )
     return pd.DataFrame(rows).sort_values("fit at 1000 rows [s]") if rows else pd.DataFrame()
 
 
@@ -548,12 +645,22 @@ def tabulate_sequences(report: Contents) -> Frame:
     runs = frame[frame["step"] >= 0].astype({"start": str})
     keys = ["sequence", "solver", "mode", "tol", "max_iter"]
     groups = runs.groupby([*keys, "start"], observed=True)
-    table = groups.agg(steps=("case", "size"), time=("time", "sum"), carry=("carry_time", "sum"),
-                       iterations=("iterations", "sum"), residual=("relative", "median")).unstack("start")  # fmt: skip
+    table = groups.agg(
+        steps=("case", "size"),
+        time=("time", "sum"),
+        carry=("carry_time", "sum"),
+        iterations=("iterations", "sum"),
+        residual=("relative", "median"),
+    ).unstack("start")
     out = table.index.to_frame(index=False)[["sequence", "solver"]].astype(str)
     out["target"] = [describe_target(*x[2:]) for x in table.index]
     for start in ("cold", "carried"):
-        for name, unit in (("steps", ""), ("time", " [s]"), ("iterations", ""), ("residual", " [-]")):
+        for name, unit in (
+            ("steps", ""),
+            ("time", " [s]"),
+            ("iterations", ""),
+            ("residual", " [-]"),
+        ):
             if (name, start) in table:
                 out[f"{name}, {start}{unit}"] = table[name, start].to_numpy()
     if "time, carried [s]" in out and "time, cold [s]" in out:
@@ -576,16 +683,25 @@ def tabulate_sweeps(report: Contents) -> Frame:
     step, which has no step before it, does not count. `steps` is the number of steps with all of these runs.
     """
     plain = list_plain_sweeps()
-    order = [*plain, *sorted(name for name, x in registry.specs().items() if x.order and name not in plain)]
+    order = [
+        *plain,
+        *sorted(name for name, x in registry.specs().items() if x.order and name not in plain),
+    ]
     runs = report.frame[(report.frame["mode"] == "budget") & (report.frame["step"] > 0)]
     runs = runs[runs["solver"].isin(order)]
     if not len(runs):
         return pd.DataFrame()
     keys = ["sequence", "solver", "max_iter", "start"]
-    groups = runs.astype(dict.fromkeys(("sequence", "solver", "start"), str)).groupby(keys, sort=False)
-    heads = {"relative": "residual, {} [-]", "velocity": "velocity error, {} [m/s]",
-             "motion_error": "motion error, {} [m/s]"}  # fmt: skip
-    table, steps = groups[list(heads)].max().unstack("start"), groups.size().unstack("start").min(axis=1)
+    groups = runs.astype(dict.fromkeys(("sequence", "solver", "start"), str)).groupby(
+        keys, sort=False
+    )
+    heads = {
+        "relative": "residual, {} [-]",
+        "velocity": "velocity error, {} [m/s]",
+        "motion_error": "motion error, {} [m/s]",
+    }
+    table = groups[list(heads)].max().unstack("start")
+    steps = groups.size().unstack("start").min(axis=1)
     out = table.index.to_frame(index=False).rename(columns={"max_iter": "sweeps"})
     for name, head in heads.items():
         for start in ("cold", "carried"):
@@ -601,7 +717,8 @@ def tabulate_changes(report: Contents) -> Frame:
     Earlier times are multiplied by the change of the time of the loop of fixed work on the same case. The number of
     compared times is `attrs["compared"]`.
     """
-    rows, keys = [], ["case", "sha", "solver", "start", "tol"]
+    rows = []
+    keys = ["case", "sha", "solver", "start", "tol"]
     assert report.earlier is not None
     frames = Contents(report.earlier).newest, report.frame[report.frame["step"] < 0]
     some = [f[f["mode"] == "tol"].astype(dict.fromkeys(keys[:4], str)) for f in frames]
@@ -615,8 +732,16 @@ def tabulate_changes(report: Contents) -> Frame:
         noise = 1.0 + max(MAX_NOISE, spread if math.isfinite(spread) else 0.0)
         if before != after and not before / noise <= after <= before * noise:
             kinds = ("lost", "reached") if math.inf in (before, after) else ("slower", "faster")
-            rows.append({"case": r.case, "solver": r.solver, "target": f"to {format_tolerance(r.tol)}",
-                         "before [s]": before, "now [s]": after, "change": kinds[int(after < before)]})  # fmt: skip
+            rows.append(
+                {
+                    "case": r.case,
+                    "solver": r.solver,
+                    "target": f"to {format_tolerance(r.tol)}",
+                    "before [s]": before,
+                    "now [s]": after,
+                    "change": kinds[int(after < before)],
+                }
+            )
     changes = pd.DataFrame(rows)
     if not rows:
         changes["change"] = ["nothing beyond noise" if len(both) else "nothing was compared"]

@@ -34,7 +34,9 @@ def format_sizes(values: Sequence[float]) -> list[str]:
     """Return two digits of each number: without exponents if no number needs one, else all with exponents."""
     known = [x for x in values if math.isfinite(x) and x != 0.0]
     write = format_size if all("e" not in format_size(x) for x in known) else format_residual
-    return [write(x) if math.isfinite(x) and x != 0.0 else "0" if x == 0.0 else NONE for x in values]
+    return [
+        write(x) if math.isfinite(x) and x != 0.0 else "0" if x == 0.0 else NONE for x in values
+    ]
 
 
 def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
@@ -45,7 +47,9 @@ def format_times_in_one_unit(values: Sequence[float]) -> tuple[str, list[str]]:
     texts = []
     for t in values:
         rounded = float(f"{t / scale:.2e}")  # Written without an exponent: 0.0652, 16.0, 1020.
-        decimals = max(0, 2 - math.floor(math.log10(abs(rounded)))) if math.isfinite(t) and rounded else 0
+        decimals = (
+            max(0, 2 - math.floor(math.log10(abs(rounded)))) if math.isfinite(t) and rounded else 0
+        )
         texts.append(f"{rounded:.{decimals}f}" if math.isfinite(t) else NONE)
     return unit, texts
 
@@ -75,7 +79,9 @@ def format_speed(v: float, unit: str = "m/s", limit: float = math.nan) -> str:
         return NONE
     for scale, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ")):
         if v >= 0.0995 * scale:
-            x, y, digits = v / scale, limit / scale, 2
+            x = v / scale
+            y = limit / scale
+            digits = 2
             while x != y and digits < 15 and f"{x:.{digits}g}" == f"{y:.{digits}g}":
                 digits += 1
             text = f"{x:.0f}" if x >= 9.95 and digits == 2 else f"{x:.{digits}g}"
@@ -122,7 +128,9 @@ def escape_unprintable(text: str, lines: bool = False) -> str:
     if text.isprintable():
         return text
     kept = "\n\t" if lines else ""
-    return "".join(ascii(c)[1:-1] if category(c) in UNPRINTABLE and c not in kept else c for c in text)
+    return "".join(
+        ascii(c)[1:-1] if category(c) in UNPRINTABLE and c not in kept else c for c in text
+    )
 
 
 def make_file_name(name: str) -> str:

@@ -37,7 +37,9 @@ from lavender.solving.limits import make_deadline
 from lavender.solving.singular_programs import program_backends
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
-UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
+UNLIMITED_ITERATIONS = (
+    10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
+)
 HANG_LIMIT = 60.0  # [s] Time limit of a solver of another package in a campaign.
 LONG_TIME = 0.05  # [s] A call that took longer is not repeated: caches and the clock hardly affect its time.
 Target: TypeAlias = tuple[str, float, int, str]  # Mode, tol, max_iter and start of a run.
@@ -55,7 +57,7 @@ CARRIED_START = (
 
 def make_task(
     case: Row, solver: str, mode: str, tol: float, max_iter: int, start: str, time_limit: float
-) -> Row:  # fmt: skip
+) -> Row:
     """Return the row of a measurement of a solver on a case before it is made."""
     own = {name: case[name] for name in ("run", "case", "sha", "step")}
     target = {"solver": solver, "mode": mode, "tol": tol, "max_iter": max_iter, "start": start}
@@ -65,8 +67,13 @@ def make_task(
 def add_times(row: Row, times: Sequence[float]) -> Row:
     """Return a row with the times [s] of its repetitions, their minimum, median and number."""
     middle = median(times) if times else math.nan
-    return {**row, "times": list(times), "time": min(times, default=math.nan), "time_median": middle,
-            "repetitions": len(times)}  # fmt: skip
+    return {
+        **row,
+        "times": list(times),
+        "time": min(times, default=math.nan),
+        "time_median": middle,
+        "repetitions": len(times),
+    }
 
 
 def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
@@ -154,7 +161,7 @@ def _stabilise_timing(solver: str) -> Iterator[None]:
 
 def measure_task(
     problem: Problem, task: Row, impulse: Any = None, repeats: int = 1, is_guarded: bool = True
-) -> tuple[Row, FloatArray | None]:  # fmt: skip
+) -> tuple[Row, FloatArray | None]:
     """Make one measurement; return its row and the final impulses (m,) [N s] or None.
 
     An exception of the solver becomes a row of status ERROR. `impulse` is the start for the start "carried"; "cold"
@@ -170,7 +177,9 @@ def measure_task(
             begun = perf_counter()
             while len(times) < repeats:
                 calibration_times.append(measure_calibration_time())
-                solution, elapsed = _time_call(case, task, impulse, limited=is_guarded and not times)
+                solution, elapsed = _time_call(
+                    case, task, impulse, limited=is_guarded and not times
+                )
                 times.append(elapsed)
                 late = elapsed > LONG_TIME or perf_counter() - begun > task["time_limit"]
                 if late or solution.status is Status.TIME_LIMIT:
@@ -179,7 +188,9 @@ def measure_task(
         # A backend may raise any exception; only its own record is lost.
         message = f"{type(error).__name__}: {error}".strip()[:500]
         return add_times(task | {"status": ERROR, "message": message}, ()), None
-    row = add_times(make_row(problem, task, solution) | {"calibration_time": min(calibration_times)}, times)
+    row = add_times(
+        make_row(problem, task, solution) | {"calibration_time": min(calibration_times)}, times
+    )
     return row, solution.impulse if np.isfinite(solution.impulse).all() else None
 
 
@@ -202,13 +213,17 @@ def _time_call(case: ContactCase, task: Row, impulse: Any, limited: bool) -> tup
 
     A plug-in may not test convergence and would then use all iterations: it runs with its default limit first.
     """
-    solver, largest, arguments = task["solver"], task["max_iter"] or None, {"tol": task["tol"]}
+    solver = task["solver"]
+    largest = task["max_iter"] or None
+    arguments = {"tol": task["tol"]}
     if limited:
         arguments["time_limit"] = task["time_limit"]
         _start_workers(case, solver)
     if task["start"] == "carried":
         arguments["impulse"] = case.problem.start() if impulse is None else impulse
-    limits = [None] if task["mode"] == "tol" and not registry.get(solver).builtin and largest else []
+    limits = (
+        [None] if task["mode"] == "tol" and not registry.get(solver).builtin and largest else []
+    )
     for max_iter in (*limits, largest):
         fresh = case.copy(task["start"])
         start_time = perf_counter()
@@ -224,12 +239,19 @@ def make_row(problem: Problem, task: Row, s: Solution) -> Row:
     is_false = s.claim_check == CONTRADICTED
     observed = explain_contradicted_claim(task["solver"], problem, s.status) if is_false else ""
     results = {
-        "status": s.status.name, "success": bool(s.success) and task["mode"] == "tol", "claim_check": s.claim_check,
+        "status": s.status.name,
+        "success": bool(s.success) and task["mode"] == "tol",
+        "claim_check": s.claim_check,
         "status_conflict": "; ".join(filter(None, (s.status_conflict, observed))),
-        "claims": s.status in CLAIM_STATUSES, "iterations": int(s.iterations),
-        "work": json.dumps({k: int(v) for k, v in s.work.items()}), "form": s.solver.form, "message": s.message[:500],
-        "setup_time": s.setup_time, "solve_time": s.solve_time, "load": machine.count_runnable_processes(),
-    }  # fmt: skip
+        "claims": s.status in CLAIM_STATUSES,
+        "iterations": int(s.iterations),
+        "work": json.dumps({k: int(v) for k, v in s.work.items()}),
+        "form": s.solver.form,
+        "message": s.message[:500],
+        "setup_time": s.setup_time,
+        "solve_time": s.solve_time,
+        "load": machine.count_runnable_processes(),
+    }
     return task | results | make_case(problem).judge(s)
 
 
@@ -263,11 +285,16 @@ class Plan:
 
     def __post_init__(self) -> None:
         tolerances = [
-            check_float("tolerance", x, above=0.0) for x in check_sequence("tolerances", self.tolerances, "numbers")
-        ]  # fmt: skip
-        budgets = [check_int("budget", n, 1) for n in check_sequence("budgets", self.budgets, "numbers")]
+            check_float("tolerance", x, above=0.0)
+            for x in check_sequence("tolerances", self.tolerances, "numbers")
+        ]
+        budgets = [
+            check_int("budget", n, 1) for n in check_sequence("budgets", self.budgets, "numbers")
+        ]
         if not tolerances and not budgets:
-            raise InputError("without tolerances and budgets there is nothing to run: give one of the two")
+            raise InputError(
+                "without tolerances and budgets there is nothing to run: give one of the two"
+            )
         # Remove duplicates: a value given twice would be run twice and change the middle value.
         object.__setattr__(self, "tolerances", tuple(sorted(set(tolerances), reverse=True)))
         object.__setattr__(self, "budgets", tuple(sorted(set(budgets))))
@@ -278,7 +305,9 @@ class Plan:
         for name in ("warm", "campaign"):
             check_bool(name, getattr(self, name))
 
-    def measure_solver(self, case: Row, spec: SolverSpec, make: Callable[[Target, int], Row]) -> None:
+    def measure_solver(
+        self, case: Row, spec: SolverSpec, make: Callable[[Target, int], Row]
+    ) -> None:
         """Measure one solver on one case; each row decides the next measurement.
 
         Runs to a tolerance come first. An exact solver runs once, at the tightest tolerance; other solvers run at each

@@ -58,7 +58,9 @@ def map_unordered(
             return
 
 
-def _call_in_worker(parent: int, function: Callable[..., Any], call_arguments: tuple[Any, ...]) -> Any:
+def _call_in_worker(
+    parent: int, function: Callable[..., Any], call_arguments: tuple[Any, ...]
+) -> Any:
     """Call the function in a worker."""
     if parent != os.getpid():
         warnings.filterwarnings("ignore", "solver plug-in")  # The parent has reported it.

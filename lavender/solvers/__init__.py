@@ -16,11 +16,24 @@ __all__ = ["SPECS", "get_spec"]
 
 # Names of the files in this folder that define a SPEC, from exact to simple methods.
 _TABLE = (
-    "auto", "direct", "newton", "lemke", "admm", "block_gauss_seidel", "nncg", "anderson", "pgs",
-    "sequential_impulses", "jacobi", "sor", "gauss_seidel",
-)  # fmt: skip
+    "auto",
+    "direct",
+    "newton",
+    "lemke",
+    "admm",
+    "block_gauss_seidel",
+    "nncg",
+    "anderson",
+    "pgs",
+    "sequential_impulses",
+    "jacobi",
+    "sor",
+    "gauss_seidel",
+)
 
-SPECS: tuple[SolverSpec, ...]  # The specs of all solvers; `__getattr__` imports them at the first access.
+SPECS: tuple[
+    SolverSpec, ...
+]  # The specs of all solvers; `__getattr__` imports them at the first access.
 
 
 def get_spec(name: str) -> SolverSpec | None:

@@ -30,10 +30,13 @@ ACCELERATED_PATIENCE = 500
 # are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570
 # rows of 17, which exceed the second-level cache.
 MAX_ENTRIES_PER_ROW, MAX_SWEPT_ENTRIES = 40, 600_000
-CONVEX_OPTION = "iterations under the cone law before those under Coulomb's law, for piles that stick"
+CONVEX_OPTION = (
+    "iterations under the cone law before those under Coulomb's law, for piles that stick"
+)
 AUTOMATIC = -1  # Value of the kernel's `convex`: it selects the law by tests.
 SWEEP_OPTION = (
-    "'pgs' or 'blocks' (each contact and joint is solved exactly); default 'pgs', under the cone law 'blocks'"
+    "'pgs' or 'blocks' (each contact and joint is solved exactly); "
+    "default 'pgs', under the cone law 'blocks'"
 )
 
 
@@ -41,9 +44,18 @@ class AcceleratedState(SweepState):
     """State of an accelerated sweep, with the memory of the acceleration."""
 
     def __init__(
-        self, problem: Problem, data: Any, order: Order, exact: bool, convex: int, memory: int, keeps: bool
+        self,
+        problem: Problem,
+        data: Any,
+        order: Order,
+        exact: bool,
+        convex: int,
+        memory: int,
+        keeps: bool,
     ) -> None:
-        sweeps = accelerated.AcceleratedSweeps(data, *make_order_plan(order), exact, memory, convex, keeps)
+        sweeps = accelerated.AcceleratedSweeps(
+            data, *make_order_plan(order), exact, memory, convex, keeps
+        )
         super().__init__(problem, data, order, sweeps, ACCELERATED_PATIENCE)
         self.exact = exact
 
@@ -68,7 +80,9 @@ class Accelerated(Sweeping):
                 "sweep='pgs' cannot solve this problem, because it has no update for the cone law: give sweep='blocks'"
             )
         if self.convex is not None and (not isinstance(self.convex, int) or self.convex < 0):
-            raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
+            raise InputError(
+                f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed"
+            )
         state: AcceleratedState = super().prepare(problem)
         return state
 
@@ -98,7 +112,9 @@ class Accelerated(Sweeping):
 
 def build_state_in_given_form(solver: Accelerated, problem: Problem) -> AcceleratedState:
     """Return the state of sweeps over the form in which the problem was given, without forming A."""
-    return solver._build_state_over_data(problem, compute_block_order(problem, solver.order), problem.metric)
+    return solver._build_state_over_data(
+        problem, compute_block_order(problem, solver.order), problem.metric
+    )
 
 
 def choose_sweep_operator(problem: Problem) -> Any:
@@ -113,7 +129,11 @@ def choose_sweep_operator(problem: Problem) -> Any:
 def estimate_sweep_work(problem: Problem) -> int:
     """Estimate the multiply-adds of one sweep over the data of `choose_sweep_operator`, without forming A."""
     entries = _max_entries(problem)
-    if entries is None and problem.generalized is not None and not is_sweep_over_jacobian_cheaper(problem):
+    if (
+        entries is None
+        and problem.generalized is not None
+        and not is_sweep_over_jacobian_cheaper(problem)
+    ):
         entries = min(int(problem.metric.entries_of_matrix), problem.m**2)
     return int(choose_sweep_data(problem).work) if entries is None else entries + 4 * problem.m
 

@@ -42,7 +42,9 @@ from lavender_ext.accelerate import admm
 from lavender_ext.factor.linear import BACKWARD_TOLERANCE, LinearSystem
 from lavender_ext.newton.solve import Layout
 
-_START_RHO = 0.1  # [-] First penalty rho, relative to the unit diagonal of B; found by measurements.
+_START_RHO = (
+    0.1  # [-] First penalty rho, relative to the unit diagonal of B; found by measurements.
+)
 # The solver stops as STALLED after this many iterations without progress. At large mass ratios, the residual rises
 # while rho is adapted.
 _ADMM_PATIENCE = 5000
@@ -72,7 +74,12 @@ class AdmmState:
         self.factorisations = self.reported = 0
         self.watch: Any = None
         self.factor: Any = None
-        self.next_steps = [self._begin_run, self._scale_matrix, self._analyse_matrix, self.update_factor]
+        self.next_steps = [
+            self._begin_run,
+            self._scale_matrix,
+            self._analyse_matrix,
+            self.update_factor,
+        ]
         # Attributes that do not depend on b: of the matrix, and of its factor for the first rho if that is kept.
         self.operator: dict[str, Any] = {}
         self.first: dict[str, Any] = {}
@@ -113,7 +120,9 @@ class AdmmState:
         if _is_over_bodies(problem):
             form = problem.velocity_form()
             # `velocity_form` has scaled K and theta by the judge's d.
-            self.is_over_bodies, self.theta, self.jacobian = True, form.theta, form.jacobian
+            self.is_over_bodies = True
+            self.theta = form.theta
+            self.jacobian = form.jacobian
             rows = problem.rows
             assert rows is not None
             # Work of one factorisation.
@@ -181,7 +190,9 @@ class AdmmState:
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
             return ()
-        system, matrix, shift = self.system, self.matrix, rho
+        system = self.system
+        matrix = self.matrix
+        shift = rho
         extra: tuple[Any, ...] = ()
         if self.is_over_bodies:
             k = self.jacobian
@@ -190,7 +201,8 @@ class AdmmState:
             if not self.has_factor:
                 self.body_solve = admm.BodySolve(*extra, k.shape[1], self.body_solve)
                 return self.body_solve, *extra
-            matrix, shift = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
+            matrix = make_pattern_symmetric(sp.csr_array(k.T @ sp.diags_array(e) @ k))
+            shift = 1.0
             # Analyse the pattern for each rho, because entries may cancel for some values of rho.
             system = LinearSystem(get_sorted_csr_arrays(matrix)[:2], USE_WIDE_LANES)
         done = _factor_shifted_matrix(system, matrix, shift, self.lu, self.deadline)
@@ -236,7 +248,9 @@ def _factor_shifted_matrix(
     largest = np.abs(values).max()
     if not np.isfinite(largest):
         return False
-    lost = _analyse_panels(system).factor(values, None, shift, PIVOT_TOLERANCE, lu, deadline=deadline)
+    lost = _analyse_panels(system).factor(
+        values, None, shift, PIVOT_TOLERANCE, lu, deadline=deadline
+    )
     if lost < 0:
         raise _OutOfTime
     if lost:
@@ -260,9 +274,13 @@ class ADMM(Solver):
 
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or not 0 <= self.memory <= MAX_MEMORY:
-            raise InputError(f"memory is {self.memory!r}; a whole number from 0 to {MAX_MEMORY} is needed")
+            raise InputError(
+                f"memory is {self.memory!r}; a whole number from 0 to {MAX_MEMORY} is needed"
+            )
         if not 0.0 < self.relaxation < 2.0:
-            raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
+            raise InputError(
+                f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed"
+            )
 
     lazy_modules = ("scipy.sparse.linalg",)
 
@@ -283,18 +301,29 @@ class ADMM(Solver):
 
     def update(self, state: AdmmState, problem: Problem) -> AdmmState:
         """Build the state for new numbers; matrix and factor stay if only b is new."""
-        return state.renew(problem) if problem.has_operator_of(state.problem) else self.prepare(problem)
+        return (
+            state.renew(problem)
+            if problem.has_operator_of(state.problem)
+            else self.prepare(problem)
+        )
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
         """Set the deadline, and do the set-up now, so that the time of an iteration is measured without it."""
         state.deadline = deadline
-        with suppress(_OutOfTime, _Breakdown, *BREAKDOWN):  # `run` repeats the set-up and reports the error.
+        with suppress(
+            _OutOfTime, _Breakdown, *BREAKDOWN
+        ):  # `run` repeats the set-up and reports the error.
             state.scale_and_factor()
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
-        self, state: AdmmState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self,
+        state: AdmmState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
     ) -> Claim:
         """Run `max_iter` iterations, or fewer if a check, a breakdown or the deadline ends them."""
         try:
@@ -306,7 +335,9 @@ class ADMM(Solver):
         splitting, inner = state.splitting, state.inner_iterations
         if state.watch.total == 0:
             splitting.start(impulse, state.problem.slack(impulse))
-        undone, message, total = splitting.undone, "", state.watch.total
+        undone = splitting.undone
+        message = ""
+        total = state.watch.total
 
         def iterate(count: int, first: bool) -> None:
             while count:
@@ -318,9 +349,11 @@ class ADMM(Solver):
         try:
             result = make_claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
         except _Breakdown as failure:
-            result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
+            result = Claim(Status.NUMERICAL_ERROR, state.watch.total)
+            message = str(failure)
         except _OutOfTime:
-            result, message = Claim(Status.TIME_LIMIT, state.watch.total - total), _LATE_MESSAGE
+            result = Claim(Status.TIME_LIMIT, state.watch.total - total)
+            message = _LATE_MESSAGE
         work = {
             "solves": result.iterations,
             "factorisations": state.factorisations - state.reported,

@@ -28,10 +28,14 @@ class BlockGaussSeidel(Sweeping):
     keeps_last = True
 
     def _build_state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        return SweepState(problem, choose_sweep_data(problem), order, keeps_last=self.keeps_last, exact=True)
+        return SweepState(
+            problem, choose_sweep_data(problem), order, keeps_last=self.keeps_last, exact=True
+        )
 
     def _add_work_to_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
-        return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))
+        return replace(
+            claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data)
+        )
 
 
 SPEC = replace(

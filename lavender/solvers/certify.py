@@ -44,11 +44,15 @@ LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
 SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
 # Largest number of factorisations to prove that the convex relaxation has no solution.
 MAX_RELAXATION_STEPS = 150
-MAX_SOFTENED_STEPS = 300  # Largest number of factorisations to solve a problem with nearly rigid rows.
+MAX_SOFTENED_STEPS = (
+    300  # Largest number of factorisations to solve a problem with nearly rigid rows.
+)
 # [-] Compliances eps of rigid rows, as multiples of d, which are tried one after the other to find a motion with the
 # smallest violation of the constraints.
 NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
-VIOLATION_TOLERANCE = 1e-6  # Relative residual to which the problems with these compliances are solved.
+VIOLATION_TOLERANCE = (
+    1e-6  # Relative residual to which the problems with these compliances are solved.
+)
 # Rows of a direction are set to zero if they are below this fraction of its largest entry in the metric of D.
 NEGLIGIBLE_ROW_FRACTION = 1e-6
 
@@ -58,7 +62,8 @@ def prove_relaxation_infeasible(
     problem: Problem, tol: float, deadline: Deadline | None = None
 ) -> Proof | None:
     """Return the proof that the convex relaxation has no solution, or None."""
-    inner, spec = problem.relaxed("cone"), get("newton")
+    inner = problem.relaxed("cone")
+    spec = get("newton")
     left = None if deadline is None else deadline.get_remaining_seconds()
     if spec.refuses(inner) is not None or (left is not None and left <= 0.0):
         return None
@@ -90,9 +95,11 @@ def certify_by_least_violation(log: Any) -> None:
     values of eps gives y to many digits, and the judge refines it. Rows with compliance may be violated: their eps is
     1 and their y is 0. Under Coulomb's law, friction is left out.
     """
-    problem, generalized = log.problem, log.problem.generalized
+    problem = log.problem
+    generalized = log.problem.generalized
     assert generalized is not None and problem.compliance is not None
-    v, cones = np.clip(generalized.change(log.impulse), -MAX_MAGNITUDE, MAX_MAGNITUDE), problem.cones
+    v = np.clip(generalized.change(log.impulse), -MAX_MAGNITUDE, MAX_MAGNITUDE)
+    cones = problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = generalized.jac.multiply(generalized.jac).tocsr()
@@ -114,15 +121,20 @@ def certify_by_least_violation(log: Any) -> None:
         kernel = general.prepare_islands(soft)
         if kernel is None or log.deadline.has_passed():
             return
-        before, lam = lam, lam.copy()
+        before = lam
+        lam = lam.copy()
         steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
-        claim = general.run_newton_steps(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.deadline)
+        claim = general.run_newton_steps(
+            soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.deadline
+        )
         if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         # Try the difference of both impulses, and the last impulse, which is better if other rows' impulses decreased.
         for y in (lam - before, lam):
             y = drop_negligible_rows(np.where(has_compliance, 0.0, y), d)
-            outside = (np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))
+            outside = (np.isfinite(cones.upper) & (y > 0.0)) | (
+                np.isfinite(cones.lower) & (y < 0.0)
+            )
             if not outside.any():
                 break
         y[outside] = 0.0
@@ -136,7 +148,9 @@ def certify_by_least_violation(log: Any) -> None:
 def certify_infeasibility(log: Any) -> None:
     """Search for a certificate that a problem has no solution; under Coulomb's law, also for the convex relaxation."""
     problem = log.problem
-    if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:
+    if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [
+        stage.solver for stage in log.stages
+    ]:
         certify_by_linear_programs(log)
     is_small = problem.m <= CERTIFICATE_ROWS
     if log.certificate is None and problem.law == "coulomb" and is_small and log.best > 1e-6:
@@ -193,7 +207,9 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     """
     if not _has_simple_bounds(problem):
         return None
-    from scipy.optimize import linprog  # Imported here: it takes 0.1 s, and only this function needs it.
+    from scipy.optimize import (
+        linprog,
+    )  # Imported here: it takes 0.1 s, and only this function needs it.
 
     # Maximise b.y with A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents and 0 <= y <= 1, in the metric of
     # d.
@@ -204,7 +220,8 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     normal = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))
     limit = cones.friction_coefficient * scale[normal] / scale
     rim = sp.csr_array(
-        (limit[tangent], (normal[tangent], np.arange(tangent.sum()))), (problem.m, int(tangent.sum()))
+        (limit[tangent], (normal[tangent], np.arange(tangent.sum()))),
+        (problem.m, int(tangent.sum())),
     )
     at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
     if not all(np.isfinite(x).all() for x in (at.data, rim.data, scale * problem.b)):
@@ -216,16 +233,26 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
     level = sp.hstack([at[free], rim[free]]).tocsr()
     low = np.concatenate([np.where(free, -1.0, 0.0), np.zeros(rim.shape[1])])
     high = np.concatenate([np.where(tangent, 0.0, 1.0), np.full(rim.shape[1], np.inf)])
-    if problem.compliance is not None:  # A certificate is 0 on rows with compliance, since y.A y = 0.
-        low[: problem.m][problem.compliance > 0.0] = high[: problem.m][problem.compliance > 0.0] = 0.0
+    if (
+        problem.compliance is not None
+    ):  # A certificate is 0 on rows with compliance, since y.A y = 0.
+        low[: problem.m][problem.compliance > 0.0] = high[: problem.m][problem.compliance > 0.0] = (
+            0.0
+        )
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": SIMPLEX_STEPS_PER_ROW * problem.m}
     if deadline.is_set:
         options["time_limit"] = deadline.get_remaining_seconds(1e-3)
     result = linprog(
-        -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
-        bounds=np.stack([low, high], 1), method="highs", options=options,
-    )  # fmt: skip
+        -gain,
+        A_ub=above,
+        b_ub=np.zeros(above.shape[0]),
+        A_eq=level,
+        b_eq=np.zeros(level.shape[0]),
+        bounds=np.stack([low, high], 1),
+        method="highs",
+        options=options,
+    )
     if result.x is None:
         return None
     x = result.x[: problem.m]
@@ -249,10 +276,12 @@ def check_infeasibility_claim(
     """
     if _is_proof(problem, claim, tol, deadline):
         return claim, ""
-    spec, left = get("auto"), deadline.get_remaining_seconds()
+    spec = get("auto")
+    left = deadline.get_remaining_seconds()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
         return claim, ""
-    solver, impulse = spec.load()(), problem.start()
+    solver = spec.load()()
+    impulse = problem.start()
     own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
     if own_claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt

@@ -61,7 +61,9 @@ def estimate_factorisation_count(problem: Problem) -> float:
 def estimate_newton_cost(count: Count, problem: Problem) -> float:
     """Estimate the cost of Newton's method over rows or bodies [ns], (1)."""
     r = RATES
-    step_cost = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
+    step_cost = (
+        r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
+    )
     return float(r["start"] + count.set_up + estimate_factorisation_count(problem) * step_cost)
 
 
@@ -126,13 +128,17 @@ def estimate_matrix_setup_cost(problem: Problem) -> float:
 
 def estimate_analysis_cost(problem: Problem) -> float:
     """Estimate the cost to compute an elimination order of A and its fill [ns]; a block is one node."""
-    entries, m = problem.max_entries, float(problem.m)
+    entries = problem.max_entries
+    m = float(problem.m)
     if entries == m * m:
         return float(RATES["full analysis entry"] * entries)
     is_known = problem.matrix is not None or "_compressed" in problem.__dict__
     band = max(bandwidth(*problem._compressed[:2])) if is_known else m
     return float(
-        RATES["analysis entry"] * entries * (problem.n_blocks / m) * (1.0 + band / ANALYSIS_BANDWIDTH)
+        RATES["analysis entry"]
+        * entries
+        * (problem.n_blocks / m)
+        * (1.0 + band / ANALYSIS_BANDWIDTH)
     )
 
 

@@ -49,7 +49,9 @@ from lavender_ext.pivot.principal import INDEFINITE, SMALL_PIVOT, SOLVED, STUCK
 
 # Refinement ends at this relative residual, or at the round-off floor if that is larger.
 REFINEMENT_RESIDUAL = 1e-13
-ROUNDS_PER_CHECK = 32  # Number of rounds of exchanges between two checks of the clock and the residual.
+ROUNDS_PER_CHECK = (
+    32  # Number of rounds of exchanges between two checks of the clock and the residual.
+)
 
 
 @dataclass
@@ -95,7 +97,9 @@ class Direct(Solver):
             work < m**3 and not problem.is_symmetric
         ):  # The check of symmetry reads all entries, so it comes last.
             work = m**3
-        return estimate_factorisation_count(problem) * (RATES["pivot row"] * m + RATES["pivot work"] * work)
+        return estimate_factorisation_count(problem) * (
+            RATES["pivot row"] * m + RATES["pivot work"] * work
+        )
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
@@ -116,7 +120,12 @@ class Direct(Solver):
         return self.prepare(problem, state.pivot)
 
     def run(
-        self, state: DirectState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self,
+        state: DirectState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
     ) -> Claim:
         run = _Run(state, impulse, max_iter, tol, Deadline(time_limit), self)
         if state.problem.m == 0:
@@ -184,8 +193,12 @@ class _Run:
     ) -> None:
         self.patient = solver.patience
         # The solver stops at a relative residual up to this value, whatever the round-off floor is.
-        self.sufficient_residual = REFINEMENT_RESIDUAL if solver.exact else max(REFINEMENT_RESIDUAL, tol)
-        self.state, self.problem, self.impulse = state, state.problem, impulse
+        self.sufficient_residual = (
+            REFINEMENT_RESIDUAL if solver.exact else max(REFINEMENT_RESIDUAL, tol)
+        )
+        self.state = state
+        self.problem = state.problem
+        self.impulse = impulse
         self.max_iter, self.tol, self.deadline = max_iter, tol, deadline
         self.best_pass: measure.Judged | None = None
         self.iterations = 0
@@ -239,7 +252,8 @@ class _Run:
     def make_claim(self, status: Status, **more: Any) -> Claim:
         """Return a claim with this status, the work and the notes."""
         state = self.state
-        work, form = self.work | self.pivot_work, "LU" if state.pivot is None else state.pivot.form
+        work = self.work | self.pivot_work
+        form = "LU" if state.pivot is None else state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
     def make_claim_for_best_iterate(self) -> Claim:
@@ -277,7 +291,9 @@ class _Run:
         if isinstance(factor, PanelsLU):
             rounded = self.is_good() or self.is_at_floor()
             if not rounded and not self.out_of_time:
-                return self.solve_with_rank_revealing_lu(f"{self.notes[0]}; LU by panels did not refine")
+                return self.solve_with_rank_revealing_lu(
+                    f"{self.notes[0]}; LU by panels did not refine"
+                )
         elif not self.is_good() and singular:
             # Try the residual of least squares in the metric of D, which is orthogonal to the range of A.
             measure.compute_slack(problem.csr_data, x, w)
@@ -290,7 +306,9 @@ class _Run:
     def solve_with_rank_revealing_lu(self, why: str) -> Claim:
         """Solve a linear system again by a rank-revealing LU factorisation; `why` begins the message."""
         before = self.work | self.pivot_work
-        before.pop("rank", None)  # The rank cannot be added to another; the new factorisation computes it.
+        before.pop(
+            "rank", None
+        )  # The rank cannot be added to another; the new factorisation computes it.
         self.state = _factor_by_rank_revealing_lu(self.problem, why)
         self.notes = [self.state.note]
         assert isinstance(self.state.general, RankRevealingFactor)
@@ -302,7 +320,8 @@ class _Run:
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run_pivoting_rounds(self, pivot: PivotState) -> Claim:
         """Run rounds of the kernel, continuing where the last run of this state stopped."""
-        rows, before = pivot.rows, pivot.rows.n_rounds
+        rows = pivot.rows
+        before = pivot.rows.n_rounds
         pivot.set_deadline(self.deadline)
         if self.state.is_running:
             self.reported = rows.work
@@ -314,7 +333,11 @@ class _Run:
             self.iterations = rows.n_rounds - before
             if code == SMALL_PIVOT and rows.passes == 0:
                 self.add_singularity_note(pivot, self.patient or pivot.symmetric)
-            proof = self.make_infeasibility_claim(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
+            proof = (
+                self.make_infeasibility_claim(rows.changed)
+                if code in (PASS_ENDED, PASSES_USED)
+                else None
+            )
             if proof is not None:
                 return proof
             is_shifted = rows.passes > 0 or not pivot.symmetric
@@ -331,7 +354,9 @@ class _Run:
     def make_claim_of_final_code(self, pivot: PivotState, code: int) -> Claim:
         """Return the claim after the final code of the kernel."""
         if code == CYCLING:
-            self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
+            self.notes.append(
+                "the exchanges cycle, and A is not symmetric: no energy decreases; see lemke"
+            )
             self.judge_start_unless_better()
         elif self.problem.law != "linear":
             if code == INDEFINITE:

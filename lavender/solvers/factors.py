@@ -31,8 +31,12 @@ PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero 
 # Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
 MAX_COMPILED_FACTOR_ROWS = 64
 MAX_COMPILED_BAND = 40  # Up to this half bandwidth, the compiled band factorisation is the fastest.
-MIN_DENSE_FRACTION = 0.1  # Above this fraction of nonzeros, dense Cholesky is faster than sparse Cholesky.
-MAX_PANELS_FRACTION = 0.25  # Supernodal LU is considered for a linear system up to this fraction of nonzeros.
+MIN_DENSE_FRACTION = (
+    0.1  # Above this fraction of nonzeros, dense Cholesky is faster than sparse Cholesky.
+)
+MAX_PANELS_FRACTION = (
+    0.25  # Supernodal LU is considered for a linear system up to this fraction of nonzeros.
+)
 # A factor by panels costs 1 + rows / PANELS_GROWTH_ROWS times its rate per entry.
 PANELS_GROWTH_ROWS = 8000.0
 # Matrices with more rows are not stored as dense arrays; at this size one takes 288 MB.
@@ -129,7 +133,8 @@ class SparseFactor:
         self.system, d = self.all_rows, self.d
         if n_free < self.m:
             indptr, indices, data = extract_free_part(indptr, indices, data, place, n_free)
-            self.system, d = LinearSystem((indptr, indices), USE_WIDE_LANES), d[place >= 0]
+            self.system = LinearSystem((indptr, indices), USE_WIDE_LANES)
+            d = d[place >= 0]
         return self.system.factor(data, d, shift, PIVOT_TOLERANCE, deadline=self.deadline)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -201,7 +206,9 @@ class LUFactor:
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
         self.lu, pivot = _factor_with_superlu(a)
-        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > PIVOT_TOLERANCE)))
+        return (
+            len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > PIVOT_TOLERANCE)))
+        )
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         scale = self.scale[self.free]
@@ -229,7 +236,9 @@ class PanelsLU:
     def accepts(problem: Problem) -> bool:
         """Return whether A is sparse with a symmetric pattern."""
         indptr, indices, _ = problem._compressed
-        return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and has_symmetric_pattern(indptr, indices)
+        return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and has_symmetric_pattern(
+            indptr, indices
+        )
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.system.solve(rhs)
@@ -278,7 +287,9 @@ class RankRevealingFactor:
         self.dense = a
         u, s, vt = np.linalg.svd(a)
         self.rank = (
-            int(np.count_nonzero(s > len(a) * PIVOT_TOLERANCE / 10.0 * s[0])) if len(s) and s[0] > 0.0 else 0
+            int(np.count_nonzero(s > len(a) * PIVOT_TOLERANCE / 10.0 * s[0]))
+            if len(s) and s[0] > 0.0
+            else 0
         )
         self.svd = (u[:, : self.rank], s[: self.rank], vt[: self.rank])
         self.null = u[:, self.rank :]

@@ -40,7 +40,11 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     """
     cones = problem.cones._select_blocks(blocks)
     names = Names(len(blocks), lambda: [problem.block_name(i) for i in blocks])
-    attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
+    attributes: dict[str, Any] = {
+        "friction": problem.friction,
+        "names": names,
+        "name": problem.name,
+    }
     b: FloatArray = problem.b[rows]
     b = b if is_rhs_valid(b) else np.zeros(len(rows))
     if problem.generalized is not None:
@@ -48,7 +52,9 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
         trees = problem.generalized.trees
         touched = np.isin(trees, np.unique(trees[problem.generalized.jac[rows].indices]))
         general = problem.generalized.restrict_to_rows_and_velocities(rows, np.flatnonzero(touched))
-        return Problem(b, cones, generalized=general, compliance=problem.compliance[rows], **attributes)
+        return Problem(
+            b, cones, generalized=general, compliance=problem.compliance[rows], **attributes
+        )
     if problem.rows is None:
         return Problem(b, cones, problem.csr[rows][:, rows], **attributes)
     bodies = problem.rows
@@ -62,11 +68,17 @@ def restrict_to_blocks(problem: Problem, blocks: IntArray, rows: IntArray) -> Pr
     number_in_part[used] = np.arange(len(used))
     joint_sizes = np.diff(bodies.joint_ptr)[joints]
     part = replace(
-        bodies, **{name: getattr(bodies, name)[used] for name in ("inv_mass", "inv_inertia", "v_free")},
-        **{name: getattr(bodies, name)[contacts] for name in ("normal", "tangent", "arm_a", "arm_b")},
+        bodies,
+        **{name: getattr(bodies, name)[used] for name in ("inv_mass", "inv_inertia", "v_free")},
+        **{
+            name: getattr(bodies, name)[contacts]
+            for name in ("normal", "tangent", "arm_a", "arm_b")
+        },
         jac=bodies.jac[rows[: int(joint_sizes.sum())]],
-        joint_ptr=np.concatenate([[0], np.cumsum(joint_sizes)]).astype(np.int32), joint_body=number_in_part[pairs[0]],
-        contact_body=number_in_part[pairs[1]], copy=False,
-    )  # fmt: skip
+        joint_ptr=np.concatenate([[0], np.cumsum(joint_sizes)]).astype(np.int32),
+        joint_body=number_in_part[pairs[0]],
+        contact_body=number_in_part[pairs[1]],
+        copy=False,
+    )
     assert problem.compliance is not None
     return Problem(b, cones, rows=part, compliance=problem.compliance[rows], **attributes)

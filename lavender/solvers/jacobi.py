@@ -35,7 +35,8 @@ class Jacobi(SweepSolver):
             check_float("omega", self.omega, above=0.0)
 
     def prepare(self, problem: Problem) -> SweepState:
-        data, order = problem.csr_data, compute_block_order(problem)
+        data = problem.csr_data
+        order = compute_block_order(problem)
         omega = serial.jacobi_damping_of_matrix(data) if self.omega is None else self.omega
         return SweepState(problem, data, order, method=serial.JACOBI, omega=omega)
 
@@ -50,7 +51,9 @@ SPEC = replace(
     operators=frozenset({"matrix"}),
     order=False,
     seed=False,
-    options={"omega": "damping factor; the default is safe for every symmetric positive semidefinite A"},
+    options={
+        "omega": "damping factor; the default is safe for every symmetric positive semidefinite A"
+    },
     summary="damped Jacobi, projected",
     reference="Saad 2003, section 4.1; Tasora, Anitescu 2011 for the projected form",
 )

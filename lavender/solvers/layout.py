@@ -43,12 +43,19 @@ class Layout:
 def is_reordered_copy_faster(problem: Problem, order: Order) -> bool:
     """Return whether sweeps over a copy are faster: for a large problem in a fixed order that is not its own order."""
     rows = problem.rows
-    if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < MIN_CONTACTS_FOR_COPY:
+    if (
+        rows is None
+        or order.is_given
+        or not order.is_fixed
+        or rows.n_contacts < MIN_CONTACTS_FOR_COPY
+    ):
         return False
     return bool(np.all(order.blocks[: rows.n_joints] < rows.n_joints))
 
 
-def copy_problem_in_block_order(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
+def copy_problem_in_block_order(
+    problem: Problem, blocks: IntArray, before: Layout | None = None
+) -> Layout:
     """Copy `problem` with its blocks in the order `blocks` (k,), joints first.
 
     `before` is the layout of a problem of the same structure in the same order; its permutations are reused.
@@ -56,7 +63,8 @@ def copy_problem_in_block_order(problem: Problem, blocks: IntArray, before: Layo
     r, c = problem.rows, problem.cones
     assert r is not None
     assert problem.compliance is not None
-    kj, mj = r.n_joints, len(r.jac)
+    kj = r.n_joints
+    mj = len(r.jac)
     size = np.diff(c.ptr)[blocks]
     ptr = np.zeros(len(blocks) + 1, np.int32)
     np.cumsum(size, out=ptr[1:])
@@ -67,15 +75,24 @@ def copy_problem_in_block_order(problem: Problem, blocks: IntArray, before: Layo
         ranks = number_bodies_by_adjacency(problem)
     else:
         rows, position, ranks = before.rows, before.position, before.rank
-    joint, contact = blocks[:kj], blocks[kj:] - kj
+    joint = blocks[:kj]
+    contact = blocks[kj:] - kj
     rank = np.append(ranks, np.int32(-1))  # A static body, -1, stays -1.
     body = np.argsort(rank[:-1])
     arrays = _copy_to_separate_pages(
-        *c._select_blocks(blocks)._blocks.arrays, problem.b[rows],
-        r.jac[rows[:mj]], rank[r.joint_body[joint]], r.normal[contact], r.tangent[contact], r.arm_a[contact],
-        r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
+        *c._select_blocks(blocks)._blocks.arrays,
+        problem.b[rows],
+        r.jac[rows[:mj]],
+        rank[r.joint_body[joint]],
+        r.normal[contact],
+        r.tangent[contact],
+        r.arm_a[contact],
+        r.arm_b[contact],
+        rank[r.contact_body[contact]],
+        r.inv_mass[body],
+        r.inv_inertia[body],
         problem.compliance[rows],
-    )  # fmt: skip
+    )
     data = Data(
         make_blocks_over_arrays(*arrays[:7]),
         arrays[7],

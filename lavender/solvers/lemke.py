@@ -30,7 +30,9 @@ from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, EXCHANGES, LATE, RAY
 
 RAY_MESSAGE = "ended on a secondary ray: this method cannot continue, but a solution may exist"
-MAX_LEMKE_ROWS = 2000  # Problems with more rows are refused; the dictionary of this many rows takes 32 MB.
+MAX_LEMKE_ROWS = (
+    2000  # Problems with more rows are refused; the dictionary of this many rows takes 32 MB.
+)
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,17 @@ class Lemke(Solver):
         return PivotState(problem, state)
 
     def run(
-        self, state: PivotState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self,
+        state: PivotState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
     ) -> Claim:
         if max_iter == 0 or state.problem.m == 0:
-            return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})
+            return Claim(
+                Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0}
+            )
         deadline = Deadline(time_limit)
         state.set_deadline(deadline)
         paths = lemke.Lemke(state.rows)
@@ -68,10 +77,17 @@ class Lemke(Solver):
         return replace(claim, judged=best)
 
     def _follow_paths(
-        self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
+        self,
+        state: PivotState,
+        paths: lemke.Lemke,
+        max_iter: int,
+        tol: float,
+        deadline: Deadline,
+        chunk: int,
     ) -> Claim:
         """Do up to `max_iter` pivots and return the claim; Ctrl-C is checked after each `chunk` pivots or exchanges."""
-        rows, message = state.rows, ""
+        rows = state.rows
+        message = ""
         certificate: FloatArray | None = None
         while True:
             code = paths.run(min(chunk, max_iter - paths.pivots))
@@ -83,9 +99,11 @@ class Lemke(Solver):
                 check_certificate(state.problem, certificate, tol, deadline) is None
             )
             if is_proof:
-                status, message = Status.INFEASIBLE, "ended on a secondary ray: no impulse meets every row"
+                status = Status.INFEASIBLE
+                message = "ended on a secondary ray: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
-                status, message = Status.CONVERGED, ""
+                status = Status.CONVERGED
+                message = ""
             elif code == DONE:
                 status = Status.ROUNDOFF_LIMIT if rows.above_floor <= tol else Status.STALLED
             elif code == LATE or deadline.has_passed():
@@ -95,10 +113,15 @@ class Lemke(Solver):
             else:
                 continue
             problem = state.problem
-            if status is Status.STALLED and problem.m <= CERTIFICATE_ROWS and not deadline.has_passed():
+            if (
+                status is Status.STALLED
+                and problem.m <= CERTIFICATE_ROWS
+                and not deadline.has_passed()
+            ):
                 proof = find_certificate_by_linear_program(problem, deadline)
                 if proof is not None and check_certificate(problem, proof, tol, deadline) is None:
-                    status, certificate = Status.INFEASIBLE, proof
+                    status = Status.INFEASIBLE
+                    certificate = proof
                     message = "a linear program found a certificate"
             work = rows.work | {"pivots": paths.pivots, "paths": paths.paths}
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)

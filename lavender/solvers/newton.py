@@ -59,7 +59,12 @@ from lavender.solvers.costs import (
     estimate_newton_cost,
 )
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, run_newton_method
+from lavender.solvers.newton_systems.systems import (
+    System,
+    find_bodies,
+    make_system,
+    run_newton_method,
+)
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.small import NEWTON, estimate_velocity_newton_cost
 from lavender_ext.core.method import OUTCOMES
@@ -71,12 +76,17 @@ FORMS = ("auto", "velocity", "impulse")
 VELOCITY_MAX_COST_RATIO = 10.0
 # If the velocity form fails, A is formed and the row form continues if A has up to this many rows.
 MAX_FORMED_ROWS = 3000
-SPARSE_WORK_RATIO = 4.0  # Time of a multiply-add of a sparse factor as a multiple of one of a dense factor.
+SPARSE_WORK_RATIO = (
+    4.0  # Time of a multiply-add of a sparse factor as a multiple of one of a dense factor.
+)
 INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
 #: Message for each code of the first phase; None if it did not solve the problem.
 WARM_START_MESSAGES = {
-    UNDECIDED: None, JUDGED: "as it came", SWEPT: "warm sweeps", SOLVED: "joints solved directly"
-}  # fmt: skip
+    UNDECIDED: None,
+    JUDGED: "as it came",
+    SWEPT: "warm sweeps",
+    SOLVED: "joints solved directly",
+}
 # The row form starts from the result of the velocity form if its relative residual does not exceed this,
 # otherwise from the default start.
 WARM_START_MAX_RESIDUAL = 1e-3
@@ -87,7 +97,9 @@ class NewtonState:
     """The linear system of a problem, built once."""
 
     problem: Problem
-    system: System | None  # None if no body in a row can move, or for the driver in generalised coordinates.
+    system: (
+        System | None
+    )  # None if no body in a row can move, or for the driver in generalised coordinates.
     general: Any = None  # Driver in generalised coordinates, or None.
     begun: bool = False  # Whether `advance` has been called, so that the next call continues.
 
@@ -140,14 +152,17 @@ class Newton(Solver):
     def estimate_setup_cost(self, problem: Problem) -> float:
         """Estimate the cost of `prepare` with the form "auto" [ns]."""
         if problem.generalized is not None:
-            rows, entries = 0.0, float(problem.metric.entries_of_matrix)
+            rows = 0.0
+            entries = float(problem.metric.entries_of_matrix)
             if problem.law == "coulomb" and not uses_dense_rows(entries, float(problem.m), False):
                 rows = estimate_matrix_setup_cost(problem) + estimate_analysis_cost(problem)
             return rows + estimate_elimination_cost(problem, "velocity elimination")
         if problem.rows is not None and problem.rows.n_bodies > 0:
             return estimate_elimination_cost(problem, "body elimination")
         is_sparse = not uses_dense_rows(problem.max_entries, problem.m, problem.law == "cone")
-        return estimate_matrix_setup_cost(problem) + (estimate_analysis_cost(problem) if is_sparse else 0.0)
+        return estimate_matrix_setup_cost(problem) + (
+            estimate_analysis_cost(problem) if is_sparse else 0.0
+        )
 
     def estimate_total_cost(self, problem: Problem) -> float:
         """Return a lower bound of the cost of all steps with the form "auto" [ns] (`NewtonState.cost`)."""
@@ -165,26 +180,39 @@ class Newton(Solver):
         if self.form not in FORMS:
             check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
-            raise InputError("form='velocity' needs J and M, and this problem was given as a matrix A")
+            raise InputError(
+                "form='velocity' needs J and M, and this problem was given as a matrix A"
+            )
         if not len(problem.b):
             return NewtonState(problem, None)
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            max_cost, m = inf, float(problem.m)
+            max_cost = inf
+            m = float(problem.m)
             if self.form == "auto" and m <= MAX_FORMED_ROWS and not problem.cones.has_round:
                 # Compare with the method over a full A.
                 count = Count(
-                    "dense", count_dense_work(problem.m), m * m, m, estimate_formation_cost(problem, False)
+                    "dense",
+                    count_dense_work(problem.m),
+                    m * m,
+                    m,
+                    estimate_formation_cost(problem, False),
                 )
                 max_cost = VELOCITY_MAX_COST_RATIO * estimate_newton_cost(count, problem)
             fixed = estimate_velocity_newton_cost(problem, 0.0)
             slope = estimate_velocity_newton_cost(problem, 1.0) - fixed
             kernel = general.prepare_islands(problem, (max_cost - fixed) / slope)
-            if kernel is not None and self.form == "auto" and _is_sparse_matrix_faster(problem, kernel.work):
+            if (
+                kernel is not None
+                and self.form == "auto"
+                and _is_sparse_matrix_faster(problem, kernel.work)
+            ):
                 kernel = None
         if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
-            bodies = find_bodies(problem)  # Interior points over bodies are faster here than the driver.
+            bodies = find_bodies(
+                problem
+            )  # Interior points over bodies are faster here than the driver.
         if bodies is None and kernel is not None:
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
@@ -219,7 +247,12 @@ class Newton(Solver):
         return self._choose_form_and_build_state(problem, state.system)
 
     def run(
-        self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self,
+        state: NewtonState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
     ) -> Claim:
         problem, system = state.problem, state.system
         if not len(problem.b):
@@ -228,7 +261,9 @@ class Newton(Solver):
             return self._run_system(problem, system, impulse, max_iter, tol, Deadline(time_limit))
         with np.errstate(all="ignore"):  # Results that overflow are judged.
             if state.general is not None:
-                return self._run_over_velocities(state, impulse, max_iter, tol, Deadline(time_limit))
+                return self._run_over_velocities(
+                    state, impulse, max_iter, tol, Deadline(time_limit)
+                )
             return self._run_system(problem, system, impulse, max_iter, tol, Deadline(time_limit))
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
@@ -245,7 +280,8 @@ class Newton(Solver):
 
         In generalised coordinates, only the method over velocities runs, without a continuation over rows.
         """
-        is_continued, state.begun = state.begun, True
+        is_continued = state.begun
+        state.begun = True
         deadline = Deadline(time_limit)
         if state.general is None:
             most = min(remaining or SPEC.max_iter, SPEC.max_iter)
@@ -284,7 +320,10 @@ class Newton(Solver):
         problem = state.problem
         claim = general.run_newton_steps(problem, state.general, impulse, max_iter, tol, deadline)
         remaining = max_iter - claim.iterations
-        if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
+        if (
+            claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED)
+            or remaining <= 0
+        ):
             return claim
         try:
             with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
@@ -304,7 +343,9 @@ class Newton(Solver):
         work = sum_work_counts((claim.work, second.work))
         form = f"{claim.form}, then {second.form or 'impulse'}"
         total = claim.iterations + second.iterations
-        return Claim(second.status, total, work, second.message, form=form, certificate=second.certificate)
+        return Claim(
+            second.status, total, work, second.message, form=form, certificate=second.certificate
+        )
 
     def _run_system(
         self,
@@ -324,7 +365,9 @@ class Newton(Solver):
             impulse[:] = system.solve.view_arrays().fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = warm_factorisations = 0
-        over_bodies = self.form == "auto" and problem.rows is not None and problem.friction == "coulomb"
+        over_bodies = (
+            self.form == "auto" and problem.rows is not None and problem.friction == "coulomb"
+        )
         if over_bodies and not is_continued and tol > 0.0 and max_iter > 0:
             counts = solve_from_guess(problem.data, impulse, tol, deadline)
             _, sweeps, warm_factorisations = counts
@@ -333,15 +376,26 @@ class Newton(Solver):
                 judged = judge_impulse(problem, impulse.copy())
                 if judged.relative <= tol:
                     return replace(claim, judged=judged)
-        solve, steps = system.solve, max(1, int(INTERRUPT_CHECK_INTERVAL / max(system.factor_seconds, 1e-6)))
+        solve = system.solve
+        steps = max(1, int(INTERRUPT_CHECK_INTERVAL / max(system.factor_seconds, 1e-6)))
         run = run_newton_method(
-            problem, solve, impulse, max_iter - warm_factorisations, tol, deadline, steps, max_total, is_continued,
-        )  # fmt: skip
+            problem,
+            solve,
+            impulse,
+            max_iter - warm_factorisations,
+            tol,
+            deadline,
+            steps,
+            max_total,
+            is_continued,
+        )
         factorisations = warm_factorisations + run.counts[0]
         counted = zip(solve.counts, COUNTED, strict=True)
         message = ", ".join([format_work_count(n, kind) for n, kind in counted if n])
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
-        return Claim(run.status, factorisations, work, message, form=system.form, certificate=run.certificate)
+        return Claim(
+            run.status, factorisations, work, message, form=system.form, certificate=run.certificate
+        )
 
 
 def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim | None:
@@ -361,7 +415,8 @@ def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:
     `SPARSE_WORK_RATIO` times as long. Under Coulomb's law, a solve over rows takes a third to a tenth of the steps.
     Under the other laws, the estimate must be a tenth.
     """
-    entries, m = float(problem.metric.entries_of_matrix), float(problem.m)
+    entries = float(problem.metric.entries_of_matrix)
+    m = float(problem.m)
     if problem.cones.has_round or uses_dense_rows(entries, m, problem.law == "cone"):
         return False
     ratio = 1.0 if problem.law == "coulomb" else VELOCITY_MAX_COST_RATIO
@@ -371,7 +426,9 @@ def _is_sparse_matrix_faster(problem: Problem, work: float) -> bool:
 def _get_refusal_reason(problem: Problem) -> str | None:
     """Return a reason not to accept round cones without J and M, else None."""
     if problem.cones._blocks.has_round and problem.generalized is None:
-        return "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
+        return (
+            "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
+        )
     return None
 
 
@@ -387,7 +444,9 @@ SPEC = SolverSpec(
     small=NEWTON,
     resumable=False,
     max_iter=2500,
-    options={"form": "unknowns: 'velocity' (of bodies), 'impulse' (of rows) or 'auto' (the default)"},
+    options={
+        "form": "unknowns: 'velocity' (of bodies), 'impulse' (of rows) or 'auto' (the default)"
+    },
     summary="interior point, active-set polish and proximal semismooth Newton",
     reference="Mehrotra 1992; Nesterov, Todd 1997; Hintermueller, Ito, Kunisch 2002; Alart, Curnier 1991; "
     "De Saxce, Feng 1998",

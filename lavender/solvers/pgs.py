@@ -44,7 +44,8 @@ class PGS(Sweeping):
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if is_sweep_over_jacobian_cheaper(problem):
             return SweepState(problem, problem.metric, order, keeps_last=self.keeps_last)
-        data, (blocks, *rest) = problem.csr_data, make_order_plan(order)
+        data = problem.csr_data
+        (blocks, *rest) = make_order_plan(order)
         # In the given order, pass no order to the kernel: it then skips two lookups per row. The bits do not change.
         row_by_row = data.single_rows and order.is_given
         sweeps = serial.Sweeps(data, _NO_ORDER if row_by_row else blocks, *rest)

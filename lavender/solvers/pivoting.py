@@ -53,22 +53,30 @@ class PivotState:
         else:
             self.chosen = self.form, band, order = "LU", problem.m - 1, None
             if problem.m > MAX_COMPILED_FACTOR_ROWS:
-                band, factor = -1, LUFactor(problem)
+                band = -1
+                factor = LUFactor(problem)
         #: Whether the factor is sparse.
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
         self.outside = factor  # The factorisation by Python; None if the kernel factors.
         get_zero_impulse_reference(problem)
         self.rows = Pivoting(
-            problem.csr_data, band, order, PIVOT_TOLERANCE, problem.metric, self.outside, problem.law == "linear",
+            problem.csr_data,
+            band,
+            order,
+            PIVOT_TOLERANCE,
+            problem.metric,
+            self.outside,
+            problem.law == "linear",
             self.symmetric,
-        )  # fmt: skip
+        )
 
     @property
     def sweeps(self) -> int:
         """Number of symmetric sweeps that guess the free rows: the minimum for a compiled factor, else by its cost."""
         if self.outside is None:
             return MIN_GUESS_SWEEPS
-        m, factor = self.problem.m, estimate_dense_factor_cost(self.problem.m)
+        m = self.problem.m
+        factor = estimate_dense_factor_cost(self.problem.m)
         if self.is_sparse:
             factor = min(factor, estimate_sparse_work(self.problem.csr.nnz, m))
         sweeps = GUESS_COST_FRACTION * factor / (2.0 * self.problem.csr_data.work)

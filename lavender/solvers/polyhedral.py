@@ -43,17 +43,24 @@ class BoundedRowForm:
 
     def convert_start(self, impulse: FloatArray) -> FloatArray:
         """Return a z (n,) of a feasible impulse (m,), or of its projection."""
-        c, out = self.problem.cones, []
-        x, contact = project_impulse(c, impulse), c.is_contact
+        c = self.problem.cones
+        out = []
+        x = project_impulse(c, impulse)
+        contact = c.is_contact
         for i, sides in _list_rows_bounded_by_normals(self.problem):
             j = c.ptr[i]
             if not sides:
                 out += list(x[j : j + 1] if contact[i] else x[j : c.ptr[i + 1]])
             elif self.problem.law == "cone":
-                fractions = [np.divide(x[j + t], s * x[j]) if s * x[j] > 0.0 else 0.0 for t, s in sides]
+                fractions = [
+                    np.divide(x[j + t], s * x[j]) if s * x[j] > 0.0 else 0.0 for t, s in sides
+                ]
                 for signs in product((1.0, -1.0), repeat=len(sides)):
                     out.append(
-                        x[j] * np.prod([0.5 * (1.0 + a * b) for a, b in zip(signs, fractions, strict=True)])  # pyright: ignore[reportArgumentType, reportCallIssue]
+                        x[j]
+                        * np.prod(
+                            [0.5 * (1.0 + a * b) for a, b in zip(signs, fractions, strict=True)]
+                        )  # pyright: ignore[reportArgumentType, reportCallIssue]
                     )
             else:
                 out.append(x[j])
@@ -67,7 +74,14 @@ def _list_rows_bounded_by_normals(problem: Problem) -> list[tuple[int, list[tupl
     c = problem.cones
     friction_bound = c.friction_coefficient
     return [
-        (i, [(t, float(friction_bound[j + t])) for t in range(1, end - j) if friction_bound[j + t] > 0.0])
+        (
+            i,
+            [
+                (t, float(friction_bound[j + t]))
+                for t in range(1, end - j)
+                if friction_bound[j + t] > 0.0
+            ],
+        )
         for i, (j, end) in enumerate(zip(c.ptr[:-1].tolist(), c.ptr[1:].tolist(), strict=True))
     ]
 
@@ -80,13 +94,16 @@ def convert_to_bounded_rows(problem: Problem) -> BoundedRowForm:
     OverflowError
         A number of the converted problem is out of range.
     """
-    c, d, contact = problem.cones, problem.d, problem.cones.is_contact
+    c = problem.cones
+    d = problem.d
+    contact = problem.cones.is_contact
     entries: list[tuple[int, int, float]] = []  # Entries of E in (1) or (2).
     couplings: list[tuple[int, int, float]] = []  # Couplings of s in (1).
     low: list[float] = []
     high: list[float] = []
     for i, sides in _list_rows_bounded_by_normals(problem):
-        j, n = int(c.ptr[i]), len(low)
+        j = int(c.ptr[i])
+        n = len(low)
         if not contact[i]:
             size = int(c.ptr[i + 1]) - j
             entries += [(j + k, n + k, 1.0) for k in range(size)]
@@ -96,14 +113,25 @@ def convert_to_bounded_rows(problem: Problem) -> BoundedRowForm:
         if problem.law == "cone":
             for k, signs in enumerate(product((1.0, -1.0), repeat=len(sides))):
                 entries.append((j, n + k, 1.0))
-                entries += [(j + t, n + k, sign * s) for sign, (t, s) in zip(signs, sides, strict=True)]
+                entries += [
+                    (j + t, n + k, sign * s) for sign, (t, s) in zip(signs, sides, strict=True)
+                ]
             count = 2 ** len(sides)
         else:
             entries.append((j, n, 1.0))
             for k, (t, s) in enumerate(sides):
-                p, q, slide, x = n + 1 + 3 * k, n + 2 + 3 * k, n + 3 + 3 * k, float(d[j + t])
+                p = n + 1 + 3 * k
+                q = n + 2 + 3 * k
+                slide = n + 3 + 3 * k
+                x = float(d[j + t])
                 entries += [(j + t, p, 1.0), (j + t, q, -1.0)]
-                couplings += [(p, slide, x), (q, slide, x), (slide, n, s * x), (slide, p, -x), (slide, q, -x)]
+                couplings += [
+                    (p, slide, x),
+                    (q, slide, x),
+                    (slide, n, s * x),
+                    (slide, p, -x),
+                    (slide, q, -x),
+                ]
             count = 1 + 3 * len(sides)
         low += [0.0] * count
         high += [np.inf] * count
@@ -126,10 +154,14 @@ def bound_converted_row_count(problem: Problem) -> int:
     if problem.law == "cone":
         sides = np.where(c.is_contact, np.diff(c.ptr) - 1, 0)
         return int(np.where(c.is_contact, 2**sides, np.diff(c.ptr)).sum())
-    return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.is_contact].sum()) if problem.law == "coulomb" else 0)
+    return problem.m + (
+        2 * int((np.diff(c.ptr) - 1)[c.is_contact].sum()) if problem.law == "coulomb" else 0
+    )
 
 
-def _make_sparse_matrix(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:
+def _make_sparse_matrix(
+    entries: list[tuple[int, int, float]], shape: tuple[int, int]
+) -> sp.csr_array:
     i, j, x = (list(part) for part in zip(*entries, strict=True)) if entries else ([], [], [])
     return sp.csr_array((np.array(x, float), (np.array(i, int), np.array(j, int))), shape=shape)
 
@@ -170,7 +202,12 @@ class BoundedRowSolver(Solver):
         return self.solver.update(converted, problem)
 
     def run(
-        self, converted: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self,
+        converted: Any,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         """Run at most `max_iter` iterations; the claim is for the original problem, not worse than at the start."""
         if not isinstance(converted, ConvertedState):
@@ -179,7 +216,9 @@ class BoundedRowSolver(Solver):
         claim = self._run_converted(converted, impulse, max_iter, tol, time_limit)
         if claim.status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             return claim
-        before, after = (judge_impulse(converted.form.problem, x).relative for x in (start, impulse.copy()))
+        before, after = (
+            judge_impulse(converted.form.problem, x).relative for x in (start, impulse.copy())
+        )
         if before < after:
             impulse[:] = start
         return replace(claim, status=Status.CONVERGED, certificate=None) if before <= tol else claim
@@ -194,7 +233,8 @@ class BoundedRowSolver(Solver):
     ) -> Claim:
         """Run the solver of bounded rows on the converted problem, and its fallback if that solver stalls."""
         form = converted.form
-        z, deadline = form.convert_start(impulse), Deadline(time_limit)
+        z = form.convert_start(impulse)
+        deadline = Deadline(time_limit)
         claim = self.solver.run(converted.state, z, max_iter, tol, time_limit)
         claim = self._convert_claim(form, claim, z, impulse, tol)
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
@@ -223,7 +263,9 @@ class BoundedRowSolver(Solver):
         impulse[:] = projected
         judged = judge_impulse(form.problem, projected)
         relative, above = judged.relative, judged.above_floor
-        status, message, proof = claim.status, claim.message, None
+        status = claim.status
+        message = claim.message
+        proof = None
         if relative <= tol:
             status = Status.CONVERGED
         elif above <= tol:
@@ -233,10 +275,13 @@ class BoundedRowSolver(Solver):
             proof = proof / (np.abs(proof).max(initial=0.0) or 1.0)
             proof = np.where(np.abs(proof) < 1e-13, 0.0, proof)  # Set rounding noise to 0.
             if check_certificate(form.problem, proof, tol) is not None:
-                status, proof = Status.STALLED, None
+                status = Status.STALLED
+                proof = None
                 message += ": of the friction as rows, which proves nothing of the problem itself"
         elif status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             status = Status.STALLED
         name = "edges of the cones" if form.problem.law == "cone" else "rows with slack"
         form_name = ", ".join(filter(None, (claim.form, name)))
-        return replace(claim, status=status, message=message, form=form_name, certificate=proof, dual=None)
+        return replace(
+            claim, status=status, message=message, form=form_name, certificate=proof, dual=None
+        )

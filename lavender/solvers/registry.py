@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypedDict
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
-from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
+from lavender.base.errors import (
+    InputError,
+    SolverUnavailable,
+    UnknownName,
+    check_name,
+    format_error,
+)
 from lavender.base.lazy_import import import_lock, import_module_under_lock
 from lavender.judge.solution import Claim
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -29,7 +35,16 @@ if TYPE_CHECKING:
 
     from lavender.solvers.small import SmallCall
 
-__all__ = ["Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
+__all__ = [
+    "Solver",
+    "SolverOptions",
+    "SolverSpec",
+    "State",
+    "available",
+    "get",
+    "known",
+    "register",
+]
 
 
 # Modules with the SPECS that are registered first. They are named by strings because they import this module.
@@ -249,12 +264,20 @@ class SolverSpec:
     builtin = False
 
     def __post_init__(self) -> None:
-        is_path = isinstance(self.factory, str) and re.fullmatch("[^:]+:[^:]+", self.factory) is not None
-        is_names = isinstance(self.requires, (tuple, list)) and all(isinstance(n, str) for n in self.requires)
+        is_path = (
+            isinstance(self.factory, str) and re.fullmatch("[^:]+:[^:]+", self.factory) is not None
+        )
+        is_names = isinstance(self.requires, (tuple, list)) and all(
+            isinstance(n, str) for n in self.requires
+        )
         fields = [
             ("name", isinstance(self.name, str) and bool(self.name), "a text that is not empty"),
             ("summary", isinstance(self.summary, str), "a text"),
-            ("factory", callable(self.factory) or is_path, "a callable, or the text 'module:attribute',"),
+            (
+                "factory",
+                callable(self.factory) or is_path,
+                "a callable, or the text 'module:attribute',",
+            ),
             ("requires", is_names, "a tuple of names of modules"),
             ("options", isinstance(self.options, Mapping), "a mapping from names to descriptions"),
         ]
@@ -272,14 +295,20 @@ class SolverSpec:
         for name, is_valid, needed in fields:
             if not is_valid:
                 given = getattr(self, name)
-                raise InputError(f"{name} of solver {self.name!r} is {given!r:.80}; {needed} is needed")
+                raise InputError(
+                    f"{name} of solver {self.name!r} is {given!r:.80}; {needed} is needed"
+                )
         for name in ("laws", "operators", "box_friction_laws"):
             object.__setattr__(self, name, frozenset(getattr(self, name)))
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
-            if kind.type == "bool" and not isinstance(value, bool):  # `type` is the annotation as a string.
+            if kind.type == "bool" and not isinstance(
+                value, bool
+            ):  # `type` is the annotation as a string.
                 check_bool(f"{name} of solver {self.name!r}", value)
-        object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
+        object.__setattr__(
+            self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter)
+        )
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", self.history and self.delegates)
@@ -303,8 +332,14 @@ class SolverSpec:
     @cached_property
     def takes_all(self) -> bool:
         """Whether the solver accepts every problem."""
-        kinds = self.box_friction_laws == {"coulomb", "cone"} and self.round_cones and self.supports_rolling
-        return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
+        kinds = (
+            self.box_friction_laws == {"coulomb", "cone"}
+            and self.round_cones
+            and self.supports_rolling
+        )
+        return (
+            kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
+        )
 
     def refuses(self, problem: Problem) -> str | None:
         """Return None if the solver accepts this problem, else the reason why not."""
@@ -314,14 +349,20 @@ class SolverSpec:
             return f"needs a positive definite P, and P is singular: use auto, or {_list_program_solvers()}"
         if self.takes_all:
             return None
-        law, blocks = problem.law, problem.cones._blocks
+        law = problem.law
+        blocks = problem.cones._blocks
         others = "use a solver of lavender.available(problem), or"
         accepts_boxes = law in ("linear", "lcp", *self.box_friction_laws)
         if law in self.laws and not accepts_boxes and problem.cones.has_box:
             return f"takes no boxes, which bound each tangent: {others} cones.shaped('disk')"
-        if law not in self.laws and not (law in self.box_friction_laws and problem.cones.is_polyhedral):
-            takes, way = ", ".join(law for law in LAWS if law in self.laws), ""
-            relaxed_laws = self.laws | (self.box_friction_laws if problem.cones.is_polyhedral else set())
+        if law not in self.laws and not (
+            law in self.box_friction_laws and problem.cones.is_polyhedral
+        ):
+            takes = ", ".join(law for law in LAWS if law in self.laws)
+            way = ""
+            relaxed_laws = self.laws | (
+                self.box_friction_laws if problem.cones.is_polyhedral else set()
+            )
             if law == "coulomb" and "cone" in relaxed_laws:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
             elif law in ("coulomb", "cone") and "lcp" in self.laws:
@@ -342,7 +383,9 @@ class SolverSpec:
         if blocks.has_round and not self.round_cones:
             return f"takes no round cones (over two tangents in one): {others} give edges as rows"
         if blocks.has_rolling and not self.supports_rolling:
-            return f"takes no contacts that resist what rolls: {others} leave the rows that roll out"
+            return (
+                f"takes no contacts that resist what rolls: {others} leave the rows that roll out"
+            )
         if self.refusal is None:
             return None
         return self.refusal(problem.disk if blocks.has_ellipse else problem) or None
@@ -351,7 +394,9 @@ class SolverSpec:
         """Return the `bounded_variant` if this solver refuses the problem only because of its bounds, else None."""
         check_problem(problem)
         other = specs().get(self.bounded_variant)
-        bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
+        bounds = (
+            other is not None and problem.law not in self.laws and other.refuses(problem) is None
+        )
         return other if bounds else None
 
     def load(self) -> Callable[..., Solver]:
@@ -376,9 +421,13 @@ class SolverSpec:
 def _list_program_solvers() -> str:
     """Return the names of installed solvers that accept a singular P, as in "clarabel, osqp or piqp"."""
     names = sorted(
-        name for name, s in specs().items() if s.singular_programs and not s.delegates and not s.missing()
+        name
+        for name, s in specs().items()
+        if s.singular_programs and not s.delegates and not s.missing()
     )
-    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "install osqp"
+    return (
+        " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "install osqp"
+    )
 
 
 @cache
@@ -412,7 +461,9 @@ def register_all_solvers() -> None:
             # Restore the order of the table, from which `get` may have registered a solver before.
             registered.pop(spec.name, None)
             _add_own(spec)
-    from importlib.metadata import entry_points  # It takes a tenth of the time of `import lavender`.
+    from importlib.metadata import (
+        entry_points,
+    )  # It takes a tenth of the time of `import lavender`.
 
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         _register_plugin(entry)
@@ -426,7 +477,9 @@ def _register_plugin(entry: EntryPoint) -> None:
         spec = entry.load()
         spec = spec if isinstance(spec, SolverSpec) else spec()
         if isinstance(spec, SolverSpec) and spec.name in registered:
-            raise InputError(f"another solver is named {spec.name!r}; give its SolverSpec a name of its own")
+            raise InputError(
+                f"another solver is named {spec.name!r}; give its SolverSpec a name of its own"
+            )
         _add_spec(spec, replace=False)
     # A plug-in may raise any error, or exit; a warning suffices, so that other solvers can be used.
     except (Exception, SystemExit) as error:
@@ -458,9 +511,13 @@ def _add_spec(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"spec is a {type(spec).__name__}; a lavender.SolverSpec is needed")
     if not re.fullmatch(r"[A-Za-z0-9_.-]+", spec.name):
-        raise InputError(f"name of solver {spec.name!r} is not of letters, digits and the characters _ . -")
+        raise InputError(
+            f"name of solver {spec.name!r} is not of letters, digits and the characters _ . -"
+        )
     if spec.name in registered and not replace:
-        raise InputError(f"a solver named {spec.name!r} is registered already; replace=True replaces it")
+        raise InputError(
+            f"a solver named {spec.name!r} is registered already; replace=True replaces it"
+        )
     registered[spec.name] = spec
 
 
@@ -506,7 +563,9 @@ def known(problem: Problem | None = None) -> dict[str, str | None]:
     }
 
 
-def available(problem: Problem | None = None, *, law: str | None = None, **capabilities: bool) -> list[str]:
+def available(
+    problem: Problem | None = None, *, law: str | None = None, **capabilities: bool
+) -> list[str]:
     """Return the names of installed solvers that accept `problem` and the law, and have the capabilities.
 
     >>> from lavender.solvers.registry import available

@@ -30,12 +30,16 @@ class ImpulseState(SweepState):
     sweeps then use `sweep_impulse`.
     """
 
-    sweep_impulse: FloatArray | None = None  # Impulse (m,) [N s] at the end of the last run, in sweep order.
+    sweep_impulse: FloatArray | None = (
+        None  # Impulse (m,) [N s] at the end of the last run, in sweep order.
+    )
     layout: Layout | None
 
     def __init__(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> None:
         layout, sweeps = (None, None) if earlier is None else (earlier.layout, earlier.sweeps)
-        data, swept, self.layout = problem.data, order, None
+        data = problem.data
+        swept = order
+        self.layout = None
         if is_reordered_copy_faster(problem, order):
             self.layout = copy_problem_in_block_order(problem, order.blocks, layout)
             data = self.layout.data
@@ -69,7 +73,9 @@ class SequentialImpulses(Sweeping):
 
     keeps_last = True
 
-    def _build_state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
+    def _build_state(
+        self, problem: Problem, order: Order, earlier: ImpulseState | None
+    ) -> ImpulseState:
         return ImpulseState(problem, order, earlier)
 
     def run(

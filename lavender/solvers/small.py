@@ -45,13 +45,22 @@ NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 
 def make_limits(
-    sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS, lanes: bool = False
+    sweeps: float,
+    max_cost: float = DECISIONS.call_cost,
+    steps: float = NEWTON_MAX_STEPS,
+    lanes: bool = False,
 ) -> FloatArray:
     """Return the limits of compiled calls over generalised velocities: number of sweeps, cost [ns], Newton steps.
 
     `lanes`: contacts of the kind that lanes of vectors solve are solved by their method.
     """
-    sweep = RATES["tree"], RATES["sweep row"], RATES["sweep cone"], RATES["sweep velocities"], sweeps
+    sweep = (
+        RATES["tree"],
+        RATES["sweep row"],
+        RATES["sweep cone"],
+        RATES["sweep velocities"],
+        sweeps,
+    )
     step = RATES["entry"], RATES["work"]["velocities"], DECISIONS.factorisations
     row_rates = RATES["velocity row"], RATES["velocity contact row"]
     rows = SMALL_ROWS, MAX_ROWS_ALWAYS_DENSE, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
@@ -69,7 +78,10 @@ def get_small_call(problem: Problem) -> Any:
 
 def _make_call(problem: Problem) -> Small | None:
     """Build the compiled call, or None for round cones, rolling friction, large islands and empty rows."""
-    cones, count, label, bounded = problem.cones, 1, None, call_uses_pivots(problem)
+    cones = problem.cones
+    count = 1
+    label = None
+    bounded = call_uses_pivots(problem)
     if cones.has_round or cones.has_rolling:
         return None
     if problem.m > SMALL_ROWS:
@@ -97,7 +109,9 @@ def describe_small_call(problem: Problem) -> str:
         if kernel is None:
             return ""
         cost, max_cost = AUTO.call.cost(problem.metric, kernel.work, kernel.islands)
-        return f"newton on J and M, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
+        return (
+            f"newton on J and M, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
+        )
     small = get_small_call(problem)
     if small is None:
         return ""
@@ -131,7 +145,11 @@ class SmallCall:
 
     def cost_limit(self, problem: Problem, kernel: Any) -> float:
         """Return the largest accepted cost [ns] of the call over J and M; 0 if the call is never made."""
-        return 0.0 if self.limits is None else float(self.call.cost(problem.metric, 0.0, kernel.islands)[1])
+        return (
+            0.0
+            if self.limits is None
+            else float(self.call.cost(problem.metric, 0.0, kernel.islands)[1])
+        )
 
     def list_claims_of_failed_call(
         self, problem: Problem, counts: tuple[int, ...] | None
@@ -141,7 +159,9 @@ class SmallCall:
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.make_claim(Status.STALLED, counts), iterations=0))]
-        done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(counts)
+        done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(
+            counts
+        )
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def make_claim(
@@ -160,11 +180,14 @@ class SmallCall:
             claim = general.make_claim(status, counts)
             if self.name == "newton":
                 return claim
-            done, ran = claim.iterations, [("newton", dict(claim.work))]
+            done = claim.iterations
+            ran = [("newton", dict(claim.work))]
             if not any(claim.work.values()):
                 return Claim(status, done, {}, no_work)
         else:
-            done, ran = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(counts)
+            done, ran = (
+                _split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts
+            )(counts)
         if self.name == "direct":
             rank, shifts = ran[0][1].get("rank"), ran[0][1].get("shifts")
             symmetric = problem.is_symmetric
@@ -179,16 +202,22 @@ class SmallCall:
         return Claim(status, done, work, describe_stages(stages) or no_work, stages=stages)
 
 
-SolverWork = list[tuple[str, dict[str, int]]]  # (name of the solver, {kind of work: count}) of each stage.
+SolverWork = list[
+    tuple[str, dict[str, int]]
+]  # (name of the solver, {kind of work: count}) of each stage.
 
 
 def _split_pivoting_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
     """Return the iterations and the work of each solver from the counts of a call with pivots."""
     done, swept, refined, factored, exchanged, shifts, rank, path = counts
     work = {
-        "sweeps": 4 * swept, "rank": rank, "shifts": shifts, "refinements": refined, "factorisations": factored,
+        "sweeps": 4 * swept,
+        "rank": rank,
+        "shifts": shifts,
+        "refinements": refined,
+        "factorisations": factored,
         "pivots": exchanged,
-    }  # fmt: skip
+    }
     direct = "direct", {kind: count for kind, count in work.items() if count}
     return done, [direct, ("lemke", {"pivots": path})] if path else [direct]
 
@@ -215,7 +244,9 @@ def _make_stages(
     else:
         before = float(judge_impulse(problem, start.copy()).relative)
     residuals = [before, *(len(ran) - 1) * [nan], after]
-    return tuple(SolverStage(name, work, *residuals[i : i + 2]) for i, (name, work) in enumerate(ran))
+    return tuple(
+        SolverStage(name, work, *residuals[i : i + 2]) for i, (name, work) in enumerate(ran)
+    )
 
 
 def describe_stages(stages: Sequence[SolverStage]) -> str:
@@ -232,7 +263,9 @@ def describe_work(name: str, work: Mapping[str, int]) -> str:
     return f"{name} {done}" if done else name
 
 
-AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS, lanes=True), True, True)
+AUTO = SmallCall(
+    "auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS, lanes=True), True, True
+)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", make_limits(inf), False)
 

@@ -36,7 +36,12 @@ class SOR(Sweeping):
 
     def _build_state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         return SweepState(
-            problem, problem.csr_data, order, keeps_last=self.keeps_last, method=serial.SOR, omega=self.omega
+            problem,
+            problem.csr_data,
+            order,
+            keeps_last=self.keeps_last,
+            method=serial.SOR,
+            omega=self.omega,
         )
 
 

@@ -15,7 +15,14 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem
 from lavender.problem.ordering import Order, compute_block_order
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
+from lavender_ext.judge.stopping_test import (
+    AT_FLOOR,
+    CONVERGED,
+    DIVERGED,
+    RUNNING,
+    STALLED,
+    StoppingTest,
+)
 from lavender_ext.sweep import serial
 
 STATUS = {
@@ -25,7 +32,9 @@ STATUS = {
     STALLED: Status.STALLED,
     AT_FLOOR: Status.ROUNDOFF_LIMIT,
 }
-SWEEP_PATIENCE = 64  # A run stops as STALLED after this many sweeps without a smaller residual at a check.
+SWEEP_PATIENCE = (
+    64  # A run stops as STALLED after this many sweeps without a smaller residual at a check.
+)
 
 
 def create_stopping_test(
@@ -55,10 +64,14 @@ class SweepState:
         self.order = self.plan = order
         if problem.metric.reference_energy < 0.0:
             get_zero_impulse_reference(problem)
-        data.share_reference(problem.metric)  # Make residuals over `data` relative to the judge's reference.
+        data.share_reference(
+            problem.metric
+        )  # Make residuals over `data` relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience, keeps_last)
         # lavender_ext.sweep.serial.Sweeps with these options; by default, relaxed updates of the blocks.
-        self.sweeps = serial.Sweeps(data, *make_order_plan(order), **options) if sweeps is None else sweeps
+        self.sweeps = (
+            serial.Sweeps(data, *make_order_plan(order), **options) if sweeps is None else sweeps
+        )
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -86,7 +99,9 @@ def is_sweep_over_jacobian_cheaper(problem: Problem) -> bool:
     if problem.generalized is None:
         return False
     data = problem.metric
-    return bool(data.work - 4 * problem.m < data.entries_of_matrix)  # `work` counts each entry of Y twice.
+    return bool(
+        data.work - 4 * problem.m < data.entries_of_matrix
+    )  # `work` counts each entry of Y twice.
 
 
 def choose_sweep_data(problem: Problem) -> Any:
@@ -103,7 +118,12 @@ class SweepSolver(Solver):
     """A solver with a `SweepState` as its state."""
 
     def run(
-        self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self,
+        state: Any,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         """Run `max_iter` sweeps in one call of the kernel, fewer if a check ends them; tol = 0 disables the checks."""
         status, done, count = state.sweeps.run(state.watch, impulse, max_iter, tol)

@@ -75,7 +75,9 @@ class AutoState:
     failed_call: tuple[int, ...] | None = None  # Counts of a compiled call that has failed.
     loop: Loop | None = None  # Loop of the solve, if it records a history.
     recorder: Recorder | None = None  # Writes the history if it is requested.
-    first_stage: int = 1  # Position of the first stage that has not run on a problem with more islands.
+    first_stage: int = (
+        1  # Position of the first stage that has not run on a problem with more islands.
+    )
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,12 @@ class Auto(Solver):
                 spec.load()().start_workers(state.problem, time_limit)
 
     def run(
-        self, state: AutoState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self,
+        state: AutoState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None,
     ) -> Claim:
         if state.loop is not None:
             state.recorder = Recorder(state.loop)
@@ -115,7 +122,12 @@ class Auto(Solver):
             return run_program_backends(SolveLog(problem, tol, max_iter, deadline), impulse)
         counts: tuple[int, ...] | None = state.failed_call
         first: FirstSweeps | None = None
-        if deadline.is_set and problem.m > SMALL_ROWS and not problem.cones.has_round and recorder is None:
+        if (
+            deadline.is_set
+            and problem.m > SMALL_ROWS
+            and not problem.cones.has_round
+            and recorder is None
+        ):
             sweeps = FirstSweeps(problem, deadline)
             if not sweeps.newton_fits(DECISIONS.ample_time):
                 first = sweeps
@@ -142,7 +154,8 @@ class Auto(Solver):
         log.start_from_better_impulse(impulse)
         log.recorder = recorder
         if first is not None:
-            tree.pace, tree.has_swept = 1.0, True
+            tree.pace = 1.0
+            tree.has_swept = True
             log.record_stage(first.name, first.claim, first.before)
         try:
             if max_iter > 0 and log.best > tol and not log.done():
@@ -171,13 +184,16 @@ class FirstSweeps:
 
     def newton_fits(self, margin: float) -> bool:
         """Return whether this multiple of the least cost of Newton's method fits in the remaining time."""
-        fits, cost = self.deadline.fits, margin * self.min_newton_cost
+        fits = self.deadline.fits
+        cost = margin * self.min_newton_cost
         return fits(cost) and fits(cost + margin * self.newton.estimate_setup_cost(self.problem))
 
     @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(self, impulse: FloatArray, tol: float, max_iter: int) -> Claim | None:
         """Sweep; return the claim of the solve, or None if other solvers continue from the result."""
-        problem, deadline, start = self.problem, self.deadline, impulse.copy()
+        problem = self.problem
+        deadline = self.deadline
+        start = impulse.copy()
         # Under Coulomb's law `nncg`, except on few bodies.
         is_small = problem.rows is not None and problem.m <= DECISIONS.island_rows
         self.name = "anderson" if problem.law != "coulomb" or is_small else "nncg"
@@ -185,7 +201,8 @@ class FirstSweeps:
         state = prepare_sweeps(solver, problem, deadline)
         loop = Loop(problem=problem, solver=solver, state=state, impulse=impulse, tol=tol)
         # Newton's method may follow: leave its time.
-        share, left = 1.0, deadline.get_remaining_nanoseconds()
+        share = 1.0
+        left = deadline.get_remaining_nanoseconds()
         margin = DECISIONS.assumed_pace if problem.law == "coulomb" else DECISIONS.newton_time
         if self.newton_fits(margin):
             newton_cost = self.min_newton_cost + self.newton.estimate_setup_cost(problem)
@@ -204,9 +221,14 @@ class FirstSweeps:
             claim = loop.run_chunks(max_iter)
         if share < 1.0 and claim.status is Status.TIME_LIMIT:
             counted = loop.done * solver.estimate_iteration_cost(problem)
-            pace = DECISIONS.pace_margin * (left - deadline.get_remaining_nanoseconds()) / max(counted, 1.0)
+            pace = (
+                DECISIONS.pace_margin
+                * (left - deadline.get_remaining_nanoseconds())
+                / max(counted, 1.0)
+            )
             if not self.newton_fits(max(pace, 1.0)):
-                share, loop.deadline = 1.0, deadline
+                share = 1.0
+                loop.deadline = deadline
                 claim = loop.run_chunks(max_iter)
         loop._keep_best()
         self.claim = claim
@@ -234,16 +256,23 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
         if stage.solver == "certificate":
             if log.deadline.fits(stage.cost):
                 is_matrix = log.problem.generalized is None
-                (certify.certify_by_linear_programs if is_matrix else certify.certify_by_least_violation)(log)
+                (
+                    certify.certify_by_linear_programs
+                    if is_matrix
+                    else certify.certify_by_least_violation
+                )(log)
             continue
         step = tree.get_step(stage.solver)
         is_sweeps = isinstance(step, Sweeps)
-        has_swept = tree.has_swept and all(isinstance(other, Iterations) for other in tree.steps.values())
+        has_swept = tree.has_swept and all(
+            isinstance(other, Iterations) for other in tree.steps.values()
+        )
         if is_sweeps and has_swept:
             tree.remaining_cost += stage.cost
             continue
         if log.deadline.is_set and not step.over and not tree.leaves_time(stage, step):
-            is_late, log.timed_out = is_sweeps or tree.has_swept, True
+            is_late = is_sweeps or tree.has_swept
+            log.timed_out = True
             if is_late:
                 break
             step.over = step.late = True
@@ -261,12 +290,19 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
     if newton is not None and not newton.over and not log.done():
         assert tree.newton_state is not None
         rest = max(tree.remaining_cost if tree.is_large else 0.0, DECISIONS.last_cost)
-        newton.run(min(get("newton").max_iter, rest / (tree.newton_state.cost / tree.newton_state.steps)))
+        newton.run(
+            min(get("newton").max_iter, rest / (tree.newton_state.cost / tree.newton_state.steps))
+        )
     if log.timed_out and not log.done():
         sweep_until_deadline(log, tree)
     last_failed = bool(log.stages) and log.best >= log.stages[-1].before
     can_continue = log.remaining_iterations > 0 or last_failed
-    if log.best > log.tol and log.certificate is None and can_continue and not log.deadline.has_passed():
+    if (
+        log.best > log.tol
+        and log.certificate is None
+        and can_continue
+        and not log.deadline.has_passed()
+    ):
         certify.certify_infeasibility(log)
 
 
@@ -280,7 +316,8 @@ def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
     blocks = np.flatnonzero(unsolved[island_of_block]).astype(np.int32)
     rows = get_rows_of_blocks(problem, blocks)
     state = AutoState(restrict_to_blocks(problem, blocks, rows), first_stage=first_stage)
-    impulse, result = log.result[rows], log.result.copy()
+    impulse = log.result[rows]
+    result = log.result.copy()
     claim = Auto().run(state, impulse, log.remaining_iterations, log.tol, log.time_left)
     result[rows] = impulse
     log.judge_and_store_best(result)
@@ -290,7 +327,8 @@ def solve_unsolved_islands(log: SolveLog, first_stage: int) -> bool:
 
 def sweep_until_deadline(log: SolveLog, tree: DecisionTree) -> None:
     """Use the remaining time for sweeps, on large problems with friction a quarter of it for `admm`."""
-    log.timed_out, fits = True, log.deadline.fits
+    log.timed_out = True
+    fits = log.deadline.fits
     shared = ("anderson", "admm from zero") if tree.is_large else ()
     for k, name in enumerate((*shared, "anderson")):
         step = tree.get_step(name)
@@ -298,7 +336,8 @@ def sweep_until_deadline(log: SolveLog, tree: DecisionTree) -> None:
         setup = 0.0 if step.state is not None else step.solver.estimate_setup_cost(log.problem)
         has_time = fits(DECISIONS.admm_sweeps * tree.pace * tree.sweep) and fits(setup)
         if not step.over and (name == "anderson" or has_time):
-            step.least, step.time_fraction = inf, DECISIONS.time_share if k < len(shared) else 1.0
+            step.least = inf
+            step.time_fraction = DECISIONS.time_share if k < len(shared) else 1.0
             step.run(inf)
         if log.done():
             return

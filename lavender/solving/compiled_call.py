@@ -26,7 +26,11 @@ def fits_in_time(problem: Problem, deadline: Deadline, loosely: bool = False) ->
 
     `loosely`: return False unless the limit is so long that no estimate is needed.
     """
-    if not deadline.is_set or len(problem.b) <= SMALL_ROWS or deadline.fits(get_loose_limit(problem)):
+    if (
+        not deadline.is_set
+        or len(problem.b) <= SMALL_ROWS
+        or deadline.fits(get_loose_limit(problem))
+    ):
         return True
     return not loosely and deadline.fits(
         DECISIONS.call_time * get("newton").load()().estimate_total_cost(problem)
@@ -57,24 +61,38 @@ def solve_small(
         Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
         made.
     """
-    if spec.small is None or not (deadline is None or fits_in_time(problem, deadline, spec.delegates)):
+    if spec.small is None or not (
+        deadline is None or fits_in_time(problem, deadline, spec.delegates)
+    ):
         return None, None
     begin = perf_counter()
     own = None if deadline is None else choose_call_deadline(problem, deadline)
     solution, judged, counts, start = solve_compiled(problem, spec, impulse, tol, own)
     if solution is not None:
         return solution, None
-    if judged is None or deadline is None or own is not deadline or judged.relative == judged.roundoff_floor:
+    if (
+        judged is None
+        or deadline is None
+        or own is not deadline
+        or judged.relative == judged.roundoff_floor
+    ):
         # `Prepared` continues: time remains, or the impulses are so large that rounding hides b.
         return None, counts
     judged = select_best_impulse(problem, judged, start, tol).refine(inf)
     judged.impulse.setflags(write=False)
     start = start if start is None or impulse is None else start.copy()
     rest = compute_postponed_fields, (problem, spec, judged, counts, start, TIME_LIMIT)
-    solution = Solution.from_fields({
-        "impulse": judged.impulse, "status": TIME_LIMIT, "tol": tol, "setup_time": 0.0,
-        "solve_time": perf_counter() - begin, "start": name_start(problem.guess, impulse), "_rest": rest,
-    })  # fmt: skip
+    solution = Solution.from_fields(
+        {
+            "impulse": judged.impulse,
+            "status": TIME_LIMIT,
+            "tol": tol,
+            "setup_time": 0.0,
+            "solve_time": perf_counter() - begin,
+            "start": name_start(problem.guess, impulse),
+            "_rest": rest,
+        }
+    )
     return solution, None
 
 
@@ -97,7 +115,12 @@ def compute_postponed_fields(
 
 bind_types(
     (
-        Problem, Solution, CONVERGED, compute_postponed_fields, make_residual, get_zero_impulse_reference,
+        Problem,
+        Solution,
+        CONVERGED,
+        compute_postponed_fields,
+        make_residual,
+        get_zero_impulse_reference,
         name_start,
     )
-)  # fmt: skip
+)

@@ -78,7 +78,9 @@ class Rule(NamedTuple):
     claims: tuple[Status, ...]
     applies: Callable[[FinishedRun, Residual], bool]
     status: Status
-    message: str = ""  # Reason, which is appended to the solver's message; "{floor}" is the round-off floor.
+    message: str = (
+        ""  # Reason, which is appended to the solver's message; "{floor}" is the round-off floor.
+    )
 
 
 def _hides_b(run: FinishedRun, judged: Residual) -> bool:
@@ -87,26 +89,64 @@ def _hides_b(run: FinishedRun, judged: Residual) -> bool:
     return run.tol < judged.relative == judged.roundoff_floor and relative <= run.tol
 
 
-_ILL_CONDITIONED = "M is ill-conditioned: residuals below {floor:.1e} are rounding errors of float64"
+_ILL_CONDITIONED = (
+    "M is ill-conditioned: residuals below {floor:.1e} are rounding errors of float64"
+)
 _HIDDEN = "rounding to float64 alone can cause a relative residual of {floor:.1e}"
 _FORMED = "its test was met only on A as it was formed, not on the given data"
 # The rules are applied in order, each to the status that the rules before it have left. `_float64_relative` is the
 # residual before its refinement for an ill-conditioned M.
 RULES = (
     Rule((CONVERGED, STALLED), _hides_b, DIVERGED, "next to such impulses float64 loses b"),
-    Rule((MAX_ITERATIONS, TIME_LIMIT, STALLED), lambda run, r: run.tol > 0.0 and r.relative <= run.tol, CONVERGED),
-    Rule((CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT), lambda run, r: r._float64_relative <= run.tol < r.relative,
-         STALLED, _ILL_CONDITIONED),
-    Rule((ROUNDOFF_LIMIT,), lambda run, r: run.tol < r.relative and r._float64_relative < math.inf,
-         STALLED, _ILL_CONDITIONED),
-    Rule((CONVERGED,), lambda run, r: r.relative > run.tol and _holds_as_formed(run), STALLED, _FORMED),
-    Rule((ROUNDOFF_LIMIT,), lambda run, r: not r.above_floor <= run.tol and _holds_as_formed(run), STALLED, _FORMED),
-    Rule((CONVERGED, STALLED), lambda run, r: r.above_floor <= run.tol < r.relative, ROUNDOFF_LIMIT),
+    Rule(
+        (MAX_ITERATIONS, TIME_LIMIT, STALLED),
+        lambda run, r: run.tol > 0.0 and r.relative <= run.tol,
+        CONVERGED,
+    ),
+    Rule(
+        (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT),
+        lambda run, r: r._float64_relative <= run.tol < r.relative,
+        STALLED,
+        _ILL_CONDITIONED,
+    ),
+    Rule(
+        (ROUNDOFF_LIMIT,),
+        lambda run, r: run.tol < r.relative and r._float64_relative < math.inf,
+        STALLED,
+        _ILL_CONDITIONED,
+    ),
+    Rule(
+        (CONVERGED,),
+        lambda run, r: r.relative > run.tol and _holds_as_formed(run),
+        STALLED,
+        _FORMED,
+    ),
+    Rule(
+        (ROUNDOFF_LIMIT,),
+        lambda run, r: not r.above_floor <= run.tol and _holds_as_formed(run),
+        STALLED,
+        _FORMED,
+    ),
+    Rule(
+        (CONVERGED, STALLED), lambda run, r: r.above_floor <= run.tol < r.relative, ROUNDOFF_LIMIT
+    ),
     # The impulse is a solution to tol, even if no exact solution exists.
-    Rule((INFEASIBLE,), lambda run, r: r.relative <= run.tol, CONVERGED, "the impulse meets tol nevertheless"),
-    Rule((CONVERGED,), lambda run, r: r.relative <= run.tol < r.roundoff_floor, ROUNDOFF_LIMIT, _HIDDEN),
-    Rule((CONVERGED,), lambda run, r: run.tol < min(r.relative, r.roundoff_floor), STALLED, _HIDDEN),
-)  # fmt: skip
+    Rule(
+        (INFEASIBLE,),
+        lambda run, r: r.relative <= run.tol,
+        CONVERGED,
+        "the impulse meets tol nevertheless",
+    ),
+    Rule(
+        (CONVERGED,),
+        lambda run, r: r.relative <= run.tol < r.roundoff_floor,
+        ROUNDOFF_LIMIT,
+        _HIDDEN,
+    ),
+    Rule(
+        (CONVERGED,), lambda run, r: run.tol < min(r.relative, r.roundoff_floor), STALLED, _HIDDEN
+    ),
+)
 
 
 def finish(run: FinishedRun) -> Solution:
@@ -128,10 +168,17 @@ def finish(run: FinishedRun) -> Solution:
     if claim is not run.claim or impulse is not run.impulse:
         run = run._replace(claim=claim, impulse=impulse)
     impulse.setflags(write=False)
-    values = {"impulse": impulse, "tol": tol, "setup_time": run.setup_time, "solve_time": run.solve_time}
+    values = {
+        "impulse": impulse,
+        "tol": tol,
+        "setup_time": run.setup_time,
+        "solve_time": run.solve_time,
+    }
     is_met = claim.status is CONVERGED and judged.relative <= tol
     is_met = is_met and (judged.roundoff_floor <= tol or tol == 0.0)
-    is_late = claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol
+    is_late = (
+        claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol
+    )
     is_late = is_late and claim.certificate is None  # No rule changes this status.
     if (is_met or is_late) and not run.refutation:
         # The other fields are computed when one of them is first read.
@@ -145,17 +192,27 @@ def finish(run: FinishedRun) -> Solution:
 
 def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> dict[str, Any]:
     """Return the other fields of a solution, the status included if the claim needs a check; else it is confirmed."""
-    spec, claim, order = run.spec, run.claim, ""
+    spec = run.spec
+    claim = run.claim
+    order = ""
     if spec.order:
         order = get_order_name(run.options.get("order", "given"))
     result = make_residual(run.problem, judged)
     fields: dict[str, Any] = {
-        "residual": result, "iterations": claim.iterations, "work": MappingProxyType(dict(claim.work)),
-        "solver": SolverRun(spec.name, run.options, claim.form, order), "message": claim.message,
-        "history": run.history, "dual": claim.dual, "certificate": None, "impulse_bound": None,
-        "claim_check": CONFIRMED, "status_conflict": "", "sweeps_per_decade": run.sweeps_per_decade,
+        "residual": result,
+        "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, run.options, claim.form, order),
+        "message": claim.message,
+        "history": run.history,
+        "dual": claim.dual,
+        "certificate": None,
+        "impulse_bound": None,
+        "claim_check": CONFIRMED,
+        "status_conflict": "",
+        "sweeps_per_decade": run.sweeps_per_decade,
         "stages": claim.stages,
-    }  # fmt: skip
+    }
     return fields | check_claim(run, result) if needs_check else fields
 
 
@@ -170,16 +227,21 @@ def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:
         if status in rule.claims and rule.applies(run, judged):
             status = rule.status
             message = _joined(message, rule.message.format(floor=judged.roundoff_floor))
-    certificate, bound, unproven, status_conflict = None, None, "", ""
+    certificate = None
+    bound = None
+    unproven = ""
+    status_conflict = ""
     if status is INFEASIBLE and claim.certificate is None:
         unproven = "no certificate was given"
     elif status in (INFEASIBLE, STALLED) and claim.certificate is not None:
         proof = prove_infeasibility(problem, claim.certificate, tol, run.deadline)
         bound = proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
-            certificate, message = proof.y, _joined(message, proof.message)
+            certificate = proof.y
+            message = _joined(message, proof.message)
         elif bound == math.inf:
-            status, message = STALLED, _joined(message, proof.reason)
+            status = STALLED
+            message = _joined(message, proof.reason)
         elif status is INFEASIBLE:
             unproven = proof.reason
         elif bound is not None:
@@ -196,25 +258,36 @@ def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:
         status_conflict = f"says CONVERGED, {refutation}"
     elif status is ROUNDOFF_LIMIT and not judged.above_floor <= tol:
         status_conflict = (
-            f"says ROUNDOFF_LIMIT, rounding does not explain a relative residual of {judged.above_floor:.2e}"
+            "says ROUNDOFF_LIMIT, rounding does not explain a relative residual of "
+            f"{judged.above_floor:.2e}"
         )
     if status in (DIVERGED, STALLED) and not message and run.spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
         message = _joined(message, _predict_iterations(run, relative))
-    unfinished = status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
+    unfinished = (
+        status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
+    )
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
     claim_check = CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED
     return {
-        "status": status, "message": message, "certificate": certificate, "impulse_bound": bound,
-        "claim_check": claim_check, "status_conflict": status_conflict,
-    }  # fmt: skip
+        "status": status,
+        "message": message,
+        "certificate": certificate,
+        "impulse_bound": bound,
+        "claim_check": claim_check,
+        "status_conflict": status_conflict,
+    }
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     """Describe why a solver that returned no message found no solution; bad diagonal entries of A come first."""
-    reason = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
+    reason = (
+        "the residual grew instead of falling"
+        if status is DIVERGED
+        else "the residual falls no further"
+    )
     message = f"{reason}, {format_work_count(iterations, 'iterations')}"
     if problem.matrix is None:
         return message
@@ -234,7 +307,8 @@ def describe_islands(judged: Residual, tol: float) -> str:
     label, relative = judged.islands[:2]
     if len(relative) < 2:
         return ""
-    problem, blocks = judged._problem, np.flatnonzero(label == judged.worst_island)
+    problem = judged._problem
+    blocks = np.flatnonzero(label == judged.worst_island)
     first, last = (problem.block_name(int(i)) for i in blocks[[0, -1]])
     names = first if len(blocks) == 1 else f"{first} to {last}"
     solved = int(np.count_nonzero(relative <= tol))
@@ -298,13 +372,17 @@ def decide_empty_rows(
         If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all such rows. None
         otherwise.
     """
-    cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
+    cones = problem.cones
+    impossible = list[int]()
+    empty = problem.metric.empty
     # Leave out friction rows, which have no fixed bounds.
     nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if (
         problem.law == "cone"
     ):  # Under the cone law, a separating normal may carry the friction of a sliding contact.
-        nonzero = nonzero[(problem.b[nonzero] > 0.0) | ~np.append(cones.friction_rows, False)[nonzero + 1]]
+        nonzero = nonzero[
+            (problem.b[nonzero] > 0.0) | ~np.append(cones.friction_rows, False)[nonzero + 1]
+        ]
     if not len(nonzero):
         return None
     for i in np.setdiff1d(nonzero, problem.vanished_rows).tolist():
@@ -317,13 +395,18 @@ def decide_empty_rows(
     if not impossible:
         return None
     get_zero_impulse_reference(problem)
-    data, size = problem.metric, np.abs(problem.b)
-    energy, velocity = size / np.sqrt(data.d), data.weight * size / data.d
+    data = problem.metric
+    size = np.abs(problem.b)
+    energy = size / np.sqrt(data.d)
+    velocity = data.weight * size / data.d
     worst = max(impossible, key=lambda i: divide_by_reference(data, energy[i], velocity[i], [i]))
-    y, b = np.zeros(problem.m), problem.b[worst]
+    y = np.zeros(problem.m)
+    b = problem.b[worst]
     y[worst] = math.copysign(1.0, b)
     if prove_infeasibility(problem, y, tol).reason:
         return None  # b of these rows is negligible, so that the answer can meet tol.
     unit = "rad/s" if problem.angular_rows[worst] else "m/s"
-    message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} {unit}"
+    message = (
+        f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} {unit}"
+    )
     return message, y, impossible

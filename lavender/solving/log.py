@@ -45,7 +45,9 @@ def get_relaxation(problem: Problem) -> Problem:
 class SolveLog:
     """Stages that ran on a problem, their work, the best impulse and the deadline."""
 
-    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
+    def __init__(
+        self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER
+    ) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
@@ -53,7 +55,8 @@ class SolveLog:
         # A stage was left out or ended early, because the remaining time was too short.
         self.timed_out = False
         # Smallest relative residual, the impulse (m,) [N s] with this residual, and the judge's result if it is known.
-        self.best, self.impulse = inf, problem._start
+        self.best = inf
+        self.impulse = problem._start
         self.judged: Any = None
         self.start = problem._start, inf  # First impulse (m,) [N s], and its relative residual.
         self._best_islands: Any = (
@@ -64,21 +67,29 @@ class SolveLog:
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
-        self.certificate: FloatArray | None = None  # Proof (m,) that no solution exists, if one was found.
+        self.certificate: FloatArray | None = (
+            None  # Proof (m,) that no solution exists, if one was found.
+        )
         # Direction (m,) that gives a lower bound of every solution's impulse, but is not a certificate.
         self.direction: FloatArray | None = None
-        self.conflict: Any = None  # `certificates.Proof` that the convex relaxation has no solution.
+        self.conflict: Any = (
+            None  # `certificates.Proof` that the convex relaxation has no solution.
+        )
         self.recorder: Recorder | None = None  # Writes the history if one is requested.
 
     def start_from_better_impulse(self, start: FloatArray) -> None:
         """Store `start` (m,) [N s], and begin from the better of it and the zero impulse in each island."""
-        get_zero_impulse_reference(self.problem)  # Then the zero impulse needs no pass of the judge.
+        get_zero_impulse_reference(
+            self.problem
+        )  # Then the zero impulse needs no pass of the judge.
         if not are_bit_identical(start, self.problem._start):
             self._best_islands = BestImpulse(self.problem.metric, start, self.tol)
             start = self._best_islands.begin
         self.impulse = start.copy()
         relative = find_relative_at_zero(self.problem, start)
-        self.best = float(measure_residual(self.problem, start).relative) if relative is None else relative
+        self.best = (
+            float(measure_residual(self.problem, start).relative) if relative is None else relative
+        )
         self.start = self.impulse, self.best
 
     @property
@@ -108,12 +119,16 @@ class SolveLog:
         relative = find_relative_at_zero(self.problem, impulse)
         is_known = relative is not None and self._best_islands is None
         if relative is None:
-            last = reuse_or_judge_impulse(self.problem, impulse, self.judged if judged is None else judged)
-            relative, impulse = float(last.relative), last.impulse
+            last = reuse_or_judge_impulse(
+                self.problem, impulse, self.judged if judged is None else judged
+            )
+            relative = float(last.relative)
+            impulse = last.impulse
             if relative < self.best:
                 self.judged = last
         if relative < self.best:
-            self.best, self.impulse = relative, impulse.copy()
+            self.best = relative
+            self.impulse = impulse.copy()
         if self.best > self.tol and not is_known:
             if self._best_islands is None:
                 self._best_islands = BestImpulse(self.problem.metric, self.problem._start, self.tol)
@@ -155,7 +170,11 @@ class SolveLog:
         self._add_claim(claim, claim.stages, direction, claim.status is Status.INFEASIBLE)
 
     def _add_claim(
-        self, claim: Claim, stages: Iterable[SolverStage], direction: FloatArray | None, is_proof: bool
+        self,
+        claim: Claim,
+        stages: Iterable[SolverStage],
+        direction: FloatArray | None,
+        is_proof: bool,
     ) -> None:
         """Add the work, the stages and the direction (m,) of a claim."""
         self.iterations += claim.iterations
@@ -220,11 +239,14 @@ class SolveLog:
         if self.conflict is not None and self.certificate is None and self.best > self.tol:
             messages.append("of the convex relaxation, " + self.conflict.message)
         return Claim(
-            Status.INTERRUPTED if self.interrupted else status, self.iterations, self.work,
+            Status.INTERRUPTED if self.interrupted else status,
+            self.iterations,
+            self.work,
             "; ".join(filter(None, messages)),
-            certificate=self.direction if self.certificate is None else self.certificate, stages=tuple(self.stages),
+            certificate=self.direction if self.certificate is None else self.certificate,
+            stages=tuple(self.stages),
             judged=self.judged,
-        )  # fmt: skip
+        )
 
 
 @dataclass
@@ -259,7 +281,8 @@ class Recorder:
 
     def record_impulse(self, solver: str, iterations: int, impulse: FloatArray) -> None:
         """Record an impulse (m,) [N s] after this number of iterations of all stages."""
-        time, begin = self.time, perf_counter()
+        time = self.time
+        begin = perf_counter()
         r = measure_residual(self.solve.problem, impulse, "float64")
         self.append_later_records(solver, [(iterations, time, r.relative, r.energy, r.velocity)])
         self.solve.recording_time += perf_counter() - begin
@@ -268,4 +291,6 @@ class Recorder:
         """Append the records of a loop that began at this number of iterations and this time [s]."""
         self.solve.recording_time += loop.recording_time
         records = loop.records or ()
-        self.append_later_records(solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records])
+        self.append_later_records(
+            solver, [(iterations + r[0], time + r[1], *r[2:]) for r in records]
+        )

@@ -78,11 +78,13 @@ class Loop:
     def run_in_one_call(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""
         start_point = self.impulse.copy()
-        deadline, begin = self.deadline, perf_counter()
+        deadline = self.deadline
+        begin = perf_counter()
         try:
             try:
                 claim = self.call_solver(
-                    max_iter, None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT)
+                    max_iter,
+                    None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT),
                 )
             finally:
                 self.time = perf_counter() - begin - self.recording_time
@@ -118,12 +120,14 @@ class Loop:
         # measured.
         seconds, first = CHUNK_TIME, FIRST_CHUNK_ITERATIONS
         if self.deadline is not None:
-            seconds, first = self._choose_chunk_time(), FIRST_LIMITED_ITERATIONS
+            seconds = self._choose_chunk_time()
+            first = FIRST_LIMITED_ITERATIONS
         chunk = min(first, max(1, int(1e9 * seconds) // max(1, self.problem.metric.work)))
         if self.deadline is not None and self.done == 0:
             chunk = max(1, chunk // LIMITED_CHUNK_MARGIN)
         records = self.records is not None or self.callback is not None
-        claim, deadline = EMPTY_CLAIM, self.deadline
+        claim = EMPTY_CLAIM
+        deadline = self.deadline
         try:
             if deadline is not None:
                 begin = perf_counter()
@@ -210,7 +214,11 @@ class Loop:
         self.recording_time += perf_counter() - begin
         # Record at 1, 2, ... 16 iterations, then after each eighth more.
         self.next_record = self.done + max(1, self.done >> 3)
-        return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
+        return (
+            bool(self.callback(self.done, self.impulse.copy(), r))
+            if self.callback is not None
+            else False
+        )
 
     def _add_to_total_work(self, claim: Claim) -> Claim:
         return replace(claim, iterations=self.done, work=self.work)
@@ -227,11 +235,17 @@ class Loop:
             self._record_residual()
         if solvers:
             solvers = [*solvers, solvers[-1]][: len(self.records)]
-        done, time, relative, energy, velocity = (np.array(c) for c in zip(*self.records, strict=True))
+        done, time, relative, energy, velocity = (
+            np.array(c) for c in zip(*self.records, strict=True)
+        )
         return History(
-            iterations=done.astype(np.int64), time=time, relative=relative, energy=energy, velocity=velocity,
+            iterations=done.astype(np.int64),
+            time=time,
+            relative=relative,
+            energy=energy,
+            velocity=velocity,
             solvers=tuple(solvers),
-        )  # fmt: skip
+        )
 
 
 def select_best_impulse(problem: Problem, result: Any, start: FloatArray | None, tol: float) -> Any:
@@ -242,7 +256,8 @@ def select_best_impulse(problem: Problem, result: Any, start: FloatArray | None,
     """
     if result.above_floor <= tol:
         return result
-    first, own = problem._start if start is None else start, result.impulse
+    first = problem._start if start is None else start
+    own = result.impulse
     with np.errstate(all="ignore"):  # Projections of large impulses may overflow without a warning.
         inside = project_impulse(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):

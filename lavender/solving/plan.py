@@ -18,7 +18,9 @@ from lavender.solvers.small import describe_small_call
 from lavender.solving.singular_programs import program_backends
 from lavender.solving.stages import DecisionTree, Stage
 
-MAX_EXPLAINED_STAGES = 6  # Largest number of stages that are listed before the alternation with doubled work.
+MAX_EXPLAINED_STAGES = (
+    6  # Largest number of stages that are listed before the alternation with doubled work.
+)
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ class Plan:
     def data(self) -> Mapping[str, Any]:
         """Return the fields as JSON-compatible values: costs in nanoseconds, None for an infinite number."""
         tables = [asdict(self), *map(asdict, self.stages)]
-        values, *stages = ({k: None if v == inf else v for k, v in table.items()} for table in tables)
+        values, *stages = (
+            {k: None if v == inf else v for k, v in table.items()} for table in tables
+        )
         return values | {"stages": stages, "in_turn": self.in_turn}
 
     def __str__(self) -> str:
@@ -74,9 +78,13 @@ class Plan:
                 limit = f"up to {max(1.0, float(f'{stage.iterations:.3g}')):.0f} iterations"
             lines.append(f"  {stage.solver:<27}{limit:<26}{stage.why}")
         if not self.in_turn:
-            return "\n".join([*lines, "then a linear program for a certificate that there is no solution"])
+            return "\n".join(
+                [*lines, "then a linear program for a certificate that there is no solution"]
+            )
         names = ", ".join(self.in_turn)
-        lines.append(f"then {names} in turn with doubled work, and a certificate that there is no solution")
+        lines.append(
+            f"then {names} in turn with doubled work, and a certificate that there is no solution"
+        )
         return "\n".join(lines)
 
 
@@ -111,15 +119,29 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
         why = "a quadratic program with a singular P: if those before it failed"
         stages = tuple(Stage(spec.name, inf, inf, why) for spec in program_backends())
         return Plan(
-            rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small="", newton=inf, sweep=inf,
-            stages=stages, in_turn=(),
-        )  # fmt: skip
+            rows=problem.m,
+            law=problem.law,
+            operator=problem.operator,
+            tol=tol,
+            small="",
+            newton=inf,
+            sweep=inf,
+            stages=stages,
+            in_turn=(),
+        )
     problem = problem.disk  # Equal to the problem if it has no ellipses.
     get_zero_impulse_reference(problem)
     tree, small = DecisionTree(problem), describe_small_call(problem)
     tree.compiled_call_failed = problem.generalized is not None and bool(small)
     stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
-        rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
-        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.iterate_one_round(1.0)),
-    )  # fmt: skip
+        rows=problem.m,
+        law=problem.law,
+        operator=problem.operator,
+        tol=tol,
+        small=small,
+        newton=tree.newton,
+        sweep=tree.sweep,
+        stages=stages,
+        in_turn=tuple(stage.solver for stage in tree.iterate_one_round(1.0)),
+    )

@@ -27,7 +27,14 @@ from lavender.base.arrays import (
     mark_read_only,
 )
 from lavender.base.deadline import NEVER, UNLIMITED, Deadline, TooLate, limit_forming, read_clock
-from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
+from lavender.base.errors import (
+    BREAKDOWN,
+    CapabilityError,
+    InputError,
+    InUse,
+    UnknownName,
+    format_error,
+)
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.certificates import prove_infeasibility
 from lavender.judge.residuals import (
@@ -67,7 +74,15 @@ if TYPE_CHECKING:
 
     from lavender.solvers.registry import SolverOptions
 
-SOLVE_ARGUMENTS = ("impulse", "tol", "velocity_tol", "max_iter", "time_limit", "history", "callback")
+SOLVE_ARGUMENTS = (
+    "impulse",
+    "tol",
+    "velocity_tol",
+    "max_iter",
+    "time_limit",
+    "history",
+    "callback",
+)
 
 
 def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOptions]) -> Prepared:
@@ -106,7 +121,8 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     """
     spec = get(solver)
     prepared = Prepared(problem, spec, cast("dict[str, Any]", options))
-    begin, setup = perf_counter(), prepared._setup
+    begin = perf_counter()
+    setup = prepared._setup
     # Form and factor all matrices that do not depend on b.
     if not problem.has_singular_program:
         if spec.builtin and not spec.external and problem.m > SMALL_ROWS:
@@ -127,7 +143,9 @@ class SetUp:
     def __init__(self, solver: Any = None, state: Any = None) -> None:
         self.solver = solver
         self.state = state  # Result of the solver's `prepare` or `update`.
-        self.is_used = False  # Whether a solve has used the state, so that the next solve has to update it.
+        self.is_used = (
+            False  # Whether a solve has used the state, so that the next solve has to update it.
+        )
         self.failure = ""  # Arithmetic error that ended the set-up; empty if there was none.
 
 
@@ -148,16 +166,22 @@ class Prepared:
             if name in spec.accepts:
                 continue
             if name in SOLVE_ARGUMENTS:
-                raise CapabilityError(f"prepare does not take {name}=: give it to prepare(...).solve")
+                raise CapabilityError(
+                    f"prepare does not take {name}=: give it to prepare(...).solve"
+                )
             if name in ("order", "ground", "seed"):
                 accepted = ", ".join(sorted(spec.accepts)) or "no options"
-                raise CapabilityError(f"solver {spec.name!r} does not take {name}=; it takes: {accepted}")
+                raise CapabilityError(
+                    f"solver {spec.name!r} does not take {name}=; it takes: {accepted}"
+                )
             known = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
             raise UnknownName(f"option of solver {spec.name!r}", name, known)
         self.spec = spec
         self.options = options
         self.problem = problem
-        self._target: tuple[Problem, FloatArray] | None = None  # [m/s] A problem and its targets b + J v*.
+        self._target: tuple[Problem, FloatArray] | None = (
+            None  # [m/s] A problem and its targets b + J v*.
+        )
         self._lock = Lock()
         self._setup = SetUp()
         self.setup_time = 0.0  # [s] Time of the preparation since the last solve.
@@ -230,7 +254,9 @@ class Prepared:
         if velocity_tol is not None:
             tol = relative_tolerance(original, velocity_tol, tol)
         if not self._lock.acquire(False):
-            raise InUse(f"this prepared {self.spec.name!r} is already solving: make one for each thread")
+            raise InUse(
+                f"this prepared {self.spec.name!r} is already solving: make one for each thread"
+            )
         try:
             solution: Solution | None = None
             failed_call: tuple[int, ...] | None = None
@@ -242,7 +268,8 @@ class Prepared:
                 if original is not self.problem:
                     if not original.has_operator_of(self.problem):
                         check_accepted(original, self.spec)
-                    self.problem, self._setup = original, SetUp()
+                    self.problem = original
+                    self._setup = SetUp()
             else:
                 deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
                 tol, max_iter = check_arguments(self.spec, tol, max_iter, history, callback)
@@ -261,7 +288,9 @@ class Prepared:
         general = original.generalized
         if original.has_singular_program or (v_free is not None and general is None):
             return original.updated(b=b, v_free=v_free)
-        target, moved, known = None, general, self._target
+        target = None
+        moved = general
+        known = self._target
         if b is not None:
             b = as_array("b", b, (original.m,), unit="m/s")
         if v_free is not None:
@@ -269,7 +298,9 @@ class Prepared:
             moved = general.with_jacobian(None, v_free)
             if b is None:
                 is_known = known is not None and known[0] is original
-                target = known[1] if known and is_known else original.b + general.multiply_by_v_free()
+                target = (
+                    known[1] if known and is_known else original.b + general.multiply_by_v_free()
+                )
                 b = mark_read_only(target - moved.multiply_by_v_free())
         updated: Problem = original._with_rhs(b, moved, None)
         if target is not None:
@@ -277,9 +308,16 @@ class Prepared:
         return updated
 
     def _solve(
-        self, original: Problem, impulse: Any, tol: float, max_iter: int, deadline: Deadline | None = None,
-        history: bool = False, callback: Callback | None = None, failed_call: tuple[int, ...] | None = None,
-    ) -> Solution:  # fmt: skip
+        self,
+        original: Problem,
+        impulse: Any,
+        tol: float,
+        max_iter: int,
+        deadline: Deadline | None = None,
+        history: bool = False,
+        callback: Callback | None = None,
+        failed_call: tuple[int, ...] | None = None,
+    ) -> Solution:
         """Prepare, step and finish, without the compiled call for small problems; solvers get `original.disk`.
 
         The arguments are checked, `failed_call` has the work counts of a compiled call that has failed.
@@ -294,11 +332,21 @@ class Prepared:
             start = original._start.copy() if original.guess is None else original.guess.copy()
         if problem is not original:
             start = original.on_disk(start)
-            callback = None if callback is None else partial(_call_in_original_tangents, original, callback)
+            callback = (
+                None
+                if callback is None
+                else partial(_call_in_original_tangents, original, callback)
+            )
         loop = Loop(
-            problem=problem, solver=None, state=None, impulse=start, tol=tol, deadline=deadline, callback=callback,
+            problem=problem,
+            solver=None,
+            state=None,
+            impulse=start,
+            tol=tol,
+            deadline=deadline,
+            callback=callback,
             records=[] if history else None,
-        )  # fmt: skip
+        )
         if setup.solver is not None:
             setup.is_used = True
             loop.solver, loop.state = setup.solver, setup.state
@@ -311,7 +359,8 @@ class Prepared:
                 setup.state.loop = loop if history else None
         solution = self._run(loop, setup, max_iter, has_default_start)
         if problem is not original:
-            result, proof = mark_read_only(original.cones.stretch * solution.impulse), solution.certificate
+            result = mark_read_only(original.cones.stretch * solution.impulse)
+            proof = solution.certificate
             # The impulse is judged again, because multiplying it by the scale of the ellipses rounds it.
             judged = measure_residual(original, result, "float64", tol=tol)
             proof = None if proof is None else mark_read_only(original.cones.stretch * proof)
@@ -326,7 +375,10 @@ class Prepared:
 
         The problem replaces the old one unless an error is raised.
         """
-        begin, spec, last, problem = perf_counter(), self.spec, self._setup, original.disk
+        begin = perf_counter()
+        spec = self.spec
+        last = self._setup
+        problem = original.disk
         is_other = original is not self.problem
         if is_other:
             if not original.has_operator_of(self.problem):
@@ -335,12 +387,17 @@ class Prepared:
         if problem.metric.reference_energy < 0.0:
             # Compute the judge's reference before a solver gets the problem.
             get_zero_impulse_reference(problem)
-        solver, setup = last.solver, SetUp()
+        solver = last.solver
+        setup = SetUp()
         if solver is None:
             solver = _make_solver(spec, self.options)
         if deadline is None or not deadline.has_passed():
             try:
-                with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
+                with (
+                    limit_forming(deadline)
+                    if deadline is not None and deadline.is_set
+                    else UNLIMITED
+                ):
                     if last.solver is not None and (
                         not is_other or same_structure(self.problem.disk, problem)
                     ):
@@ -372,9 +429,12 @@ class Prepared:
     def _run(self, loop: Loop, setup: SetUp, max_iter: int, has_default_start: bool) -> Solution:
         """Run the solver unless the problem is decided without it, and build the solution."""
         spec, problem, deadline = self.spec, loop.problem, loop.deadline
-        setup_time, self.setup_time = self.setup_time, 0.0
+        setup_time = self.setup_time
+        self.setup_time = 0.0
         is_foreign = spec.external or not spec.builtin
-        start, refutation, proof = loop.impulse.copy(), "", None
+        start = loop.impulse.copy()
+        refutation = ""
+        proof = None
         if len(problem.metric.empty):
             proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
@@ -383,12 +443,15 @@ class Prepared:
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
         elif setup.failure:
             claim = Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
-        elif setup.solver is None or (deadline is not None and deadline.has_passed() and not spec.external):
+        elif setup.solver is None or (
+            deadline is not None and deadline.has_passed() and not spec.external
+        ):
             claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
             loop.keep_start()
         else:
             has_checks = (
-                type(getattr(setup.state, "watch", None)) is StoppingTest and setup.solver.checks_start
+                type(getattr(setup.state, "watch", None)) is StoppingTest
+                and setup.solver.checks_start
             )
             keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
             is_given = not (has_default_start or problem.has_singular_program)
@@ -403,19 +466,29 @@ class Prepared:
                 claim, refutation = self._select_best_impulse(loop, claim, start, has_checks)
         if claim.status is INFEASIBLE:
             if is_foreign:
-                claim, refutation = check_infeasibility_claim(problem, claim, loop.tol, deadline or NEVER)
+                claim, refutation = check_infeasibility_claim(
+                    problem, claim, loop.tol, deadline or NEVER
+                )
             if claim.certificate is not None and loop.tol > 0.0 and proof is None:
                 claim = self._solve_feasible_islands(loop, claim, max_iter)
         if claim.judged is not loop.judged:
             claim = replace(claim, judged=loop.judged)
         return finish(
             FinishedRun(
-                problem, spec, self.options, loop.impulse, claim, tol=loop.tol, setup_time=setup_time,
-                solve_time=loop.time, history=None if loop.records is None else loop.get_history(),
-                sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)), refutation=refutation,
+                problem,
+                spec,
+                self.options,
+                loop.impulse,
+                claim,
+                tol=loop.tol,
+                setup_time=setup_time,
+                solve_time=loop.time,
+                history=None if loop.records is None else loop.get_history(),
+                sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)),
+                refutation=refutation,
                 deadline=deadline or NEVER,
             )
-        )  # fmt: skip
+        )
 
     def _select_best_impulse(
         self, loop: Loop, claim: Claim, start: FloatArray, has_checks: bool
@@ -424,7 +497,9 @@ class Prepared:
 
         `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
         """
-        spec, problem, refutation = self.spec, loop.problem, ""
+        spec = self.spec
+        problem = loop.problem
+        refutation = ""
         claim = name_lost_row(problem, loop.impulse, claim)
         keeps_best = spec.delegates and not problem.has_singular_program
         checked = has_checks and loop.state.watch.has_best
@@ -460,7 +535,8 @@ class Prepared:
         max_iter -= claim.iterations
         if loop.tol == 0.0 or max_iter < 0 or (deadline is not None and deadline.has_passed()):
             return claim
-        problem, start = loop.problem, loop.impulse.copy()
+        problem = loop.problem
+        start = loop.impulse.copy()
         b = problem.b.copy()
         b[rows] = start[rows] = 0.0
         try:
@@ -470,7 +546,9 @@ class Prepared:
         left = None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT)
         solution = others.solve(impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=left)
         impulses = (solution.impulse,)
-        loop.impulse[:] = combine_best_islands(problem, loop.impulse, impulses, loop.tol, by_energy=True)
+        loop.impulse[:] = combine_best_islands(
+            problem, loop.impulse, impulses, loop.tol, by_energy=True
+        )
         loop.time += solution.setup_time + solution.solve_time
         work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
@@ -525,7 +603,9 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
     except (TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
+        raise InputError(
+            f"solver {spec.name!r} cannot take the options {options}: {error}"
+        ) from error
     if not spec.builtin:
         # Import the adapters of other packages only here, because they take a quarter of the time of `import lavender`.
         from lavender.external.foreign import ForeignSolver
@@ -543,7 +623,10 @@ def same_structure(p: Problem, q: Problem) -> bool:
     """Return whether two problems have the same blocks, form of A, and bodies or sparsity pattern."""
     if p.has_operator_of(q):
         return True
-    if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
+    if (
+        not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind))
+        or p.law != q.law
+    ):
         return False
     if p.rows is not None and q.rows is not None:
         pairs = (p.rows.joint_body, q.rows.joint_body), (p.rows.contact_body, q.rows.contact_body)
@@ -551,6 +634,8 @@ def same_structure(p: Problem, q: Problem) -> bool:
     if p.operator != q.operator:
         return False
     if p.generalized is not None and q.generalized is not None:
-        patterns = ((*g.operator.jac[:2], *g.operator.mass[:2]) for g in (p.generalized, q.generalized))
+        patterns = (
+            (*g.operator.jac[:2], *g.operator.mass[:2]) for g in (p.generalized, q.generalized)
+        )
         return all(map(are_equal, *patterns))
     return all(map(are_equal, p._compressed[:2], q._compressed[:2]))

@@ -30,21 +30,29 @@ def run_program_backends(log: SolveLog, impulse: FloatArray) -> Claim:
 
     If no backend reaches tol, the result with the smallest error of the program is returned.
     """
-    problem, tol, start = log.problem, log.tol, impulse.copy()
+    problem = log.problem
+    tol = log.tol
+    start = impulse.copy()
     log.judge_and_store_best(impulse)
-    error, best = program_error(problem, log.impulse), log.impulse
+    error = program_error(problem, log.impulse)
+    best = log.impulse
     try:
         for spec in program_backends():
             if log.done() and (log.status is not Status.ROUNDOFF_LIMIT or error <= tol):
                 break
-            solver, before, trial = spec.load()(), log.best, start.copy()
+            solver = spec.load()()
+            before = log.best
+            trial = start.copy()
             state = solver.prepare(problem)
-            claim = solver.run(state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left)
+            claim = solver.run(
+                state, trial, min(log.remaining_iterations, spec.max_iter), tol, log.time_left
+            )
             log.judge_and_store_best(trial)
             log.record_stage(spec.name, claim, before)
             for result in (trial, log.impulse if log.best <= tol else log.result):
                 if program_error(problem, result) < error:
-                    error, best = program_error(problem, result), result.copy()
+                    error = program_error(problem, result)
+                    best = result.copy()
             if tol == 0.0:
                 break
         if error > tol > 0.0 and not log.done():

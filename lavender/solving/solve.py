@@ -91,7 +91,9 @@ def solve(
     InputError
         `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid; `velocity_tol` and another `tol`.
     """
-    if type(problem) is not Problem:  # Check this first, because a frequent error is to pass A and b.
+    if (
+        type(problem) is not Problem
+    ):  # Check this first, because a frequent error is to pass A and b.
         check_problem(problem)
     if surplus:
         raise InputError(
@@ -112,11 +114,15 @@ def solve(
         deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
         prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False)
         tol, max_iter = check_arguments(spec, tol, max_iter, history, callback)
-        solution = prepared._solve(problem, impulse, tol, max_iter, deadline, history, callback, failed_call)
+        solution = prepared._solve(
+            problem, impulse, tol, max_iter, deadline, history, callback, failed_call
+        )
     return solution if velocity_tol is None else accept_velocity(solution, velocity_tol)
 
 
-def _solve_after_call(problem: Problem, spec: SolverSpec, impulse: Any, tol: float, counts: Any) -> Solution:
+def _solve_after_call(
+    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, counts: Any
+) -> Solution:
     """Solve a problem that the compiled call with these work counts did not solve."""
     prepared = Prepared(problem, spec, {}, False)
     return prepared._solve(problem, impulse, *check_arguments(spec, tol, None), failed_call=counts)
@@ -130,9 +136,11 @@ def _reject_solver(solver: Any) -> NoReturn:
     elif isinstance(solver, np.ndarray | list | tuple):
         example = "impulse=..."
     elif isinstance(solver, float):
-        example, value = "tol=...", f"{solver:g}"
+        example = "tol=..."
+        value = f"{solver:g}"
     elif type(solver) is int:
-        example, value = "max_iter=...", f"{solver}"
+        example = "max_iter=..."
+        value = f"{solver}"
     else:
         get(solver)  # Raises UnknownName with the names of the solvers.
         example = "solver=..."

@@ -14,7 +14,12 @@ from lavender.base.deadline import NEVER, Deadline, format_seconds
 from lavender.base.errors import BREAKDOWN
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
-from lavender.solvers.costs import RATES, estimate_first_factor_cost, estimate_formation_cost, get_loose_limit
+from lavender.solvers.costs import (
+    RATES,
+    estimate_first_factor_cost,
+    estimate_formation_cost,
+    get_loose_limit,
+)
 from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.newton_systems.systems import find_bodies
@@ -31,8 +36,12 @@ class Stage:
     iterations: float  # Largest number of iterations.
     cost: float  # [ns] Estimated cost of these iterations.
     why: str  # Reason, for `lavender.explain`.
-    least: float = inf  # Sweeps stop if they predict that more than this number of sweeps is still needed.
-    position: int = 0  # Among the stages after which only unsolved islands continue; 0 for other stages.
+    least: float = (
+        inf  # Sweeps stop if they predict that more than this number of sweeps is still needed.
+    )
+    position: int = (
+        0  # Among the stages after which only unsolved islands continue; 0 for other stages.
+    )
 
 
 class DecisionTree:
@@ -52,8 +61,12 @@ class DecisionTree:
     def __init__(
         self, problem: Problem, deadline: Deadline = NEVER, log: Any = None, first_stage: int = 1
     ) -> None:
-        self.problem, self.law, self.deadline, self.log = problem, problem.law, deadline, log
-        self.first_stage, self.steps = first_stage, dict[str, Step]()
+        self.problem = problem
+        self.law = problem.law
+        self.deadline = deadline
+        self.log = log
+        self.first_stage = first_stage
+        self.steps = dict[str, Step]()
         self.sweep = make_solver("anderson", problem).estimate_iteration_cost(
             problem
         )  # [ns] Cost of one sweep.
@@ -112,7 +125,9 @@ class DecisionTree:
         if rows is None:
             return False
         body = rows.contact_body.astype(np.int64)
-        if len(body) < DECISIONS.face_contacts * len(np.unique(body[:, 0] * (1 << 32) + body[:, 1])):
+        if len(body) < DECISIONS.face_contacts * len(
+            np.unique(body[:, 0] * (1 << 32) + body[:, 1])
+        ):
             return False
         state = self.newton_state
         return state is not None and state.cost < DECISIONS.cheap_newton * self.relaxed_sweep
@@ -138,7 +153,9 @@ class DecisionTree:
         is_cheap = formation <= (self.first if self.law == "lcp" else self.min_newton_cost)
         if not is_cheap or not self.deadline.fits(formation / DECISIONS.time_share):
             return inf
-        return formation + float(make_solver("direct", self.problem).estimate_total_cost(self.problem))
+        return formation + float(
+            make_solver("direct", self.problem).estimate_total_cost(self.problem)
+        )
 
     @property
     def newton(self) -> float:
@@ -152,7 +169,8 @@ class DecisionTree:
 
     def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
-        fits, needed = self.deadline.fits, before + self.pace * cost
+        fits = self.deadline.fits
+        needed = before + self.pace * cost
         if name == "newton" and "newton_state" in vars(self):
             return fits(needed)
         loose = get_loose_limit(self.problem)
@@ -217,7 +235,9 @@ class DecisionTree:
             yield from islice(self.iterate_factorising_stages(0.25 * ratio), 1)
             # The certificate's smallest violation is computed over velocities.
             cost = self.newton if self.newton_state is None else self.newton_state.cost
-            yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
+            yield Stage(
+                "certificate", 1.0, cost, "whether the least violation proves that there is none"
+            )
         if not self.is_large:
             for stage in self.iterate_factorising_stages(ratio):
                 if not (pivots_first and stage.solver == "direct"):  # It has had this budget.
@@ -231,19 +251,27 @@ class DecisionTree:
         """Yield the first stages of a large problem with friction, unless they have run on a larger problem."""
         if self.first_stage <= 1 and not self.has_cheap_newton:
             cost = self.min_newton_cost
-            yield Stage("anderson", inf, cost, "before any analysis", cost / self.relaxed_sweep, position=1)
+            yield Stage(
+                "anderson", inf, cost, "before any analysis", cost / self.relaxed_sweep, position=1
+            )
         state = self.newton_state
         if state is None:
             return
         if self.first_stage <= 2 and not self.has_cheap_newton:
             why = f"up to {format_seconds(1e-9 * state.cost)}, as much as newton costs"
-            yield Stage("anderson", inf, state.cost, why, least=state.cost / self.relaxed_sweep, position=2)
+            yield Stage(
+                "anderson", inf, state.cost, why, least=state.cost / self.relaxed_sweep, position=2
+            )
         if self.first_stage <= 3:
-            n, why = DECISIONS.relaxed_ratio * state.steps, "exact if no contact slips"
+            n = DECISIONS.relaxed_ratio * state.steps
+            why = "exact if no contact slips"
             yield Stage("newton on the relaxation", n, state.cost, why, position=3)
         if self.log is None or self.log.relaxed is not None:
-            n, why = DECISIONS.trial_iterations, "from the relaxation, while it is predicted to end soon"
-            yield from self.repeat_while_converging(Stage("admm", n, n * self.relaxed_sweep, why), 2)
+            n = DECISIONS.trial_iterations
+            why = "from the relaxation, while it is predicted to end soon"
+            yield from self.repeat_while_converging(
+                Stage("admm", n, n * self.relaxed_sweep, why), 2
+            )
 
     def iterate_factorising_stages(self, times: float) -> Iterator[Stage]:
         """Yield stages of the factorising solvers; each may cost `times` the estimated cost of the cheapest of them."""
@@ -267,19 +295,25 @@ class DecisionTree:
                     return
                 fraction = min(1.0, self.remaining_cost / stage.cost)
                 self.remaining_cost -= fraction * stage.cost
-                yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
+                yield replace(
+                    stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost
+                )
             if k > 0 and self.best >= before:
                 return
 
     def iterate_one_round(self, times: float) -> Iterator[Stage]:
         """Yield one round, in which each solver may cost `times` the cheapest factorising solver."""
-        p, cost, setup = self.problem, times * self.unit, 0.0
+        p = self.problem
+        cost = times * self.unit
+        setup = 0.0
         why = f"in turn, {times:.3g} times the cheapest factorising solver's cost"
         yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         if self.is_large:
             # An iteration costs as much as a sweep under the cone law.
             n = DECISIONS.admm_fraction * cost / self.relaxed_sweep
-            yield from self.repeat_while_converging(Stage("admm", n, DECISIONS.admm_fraction * cost, why))
+            yield from self.repeat_while_converging(
+                Stage("admm", n, DECISIONS.admm_fraction * cost, why)
+            )
             return
         n = 0.5 * cost / self.sweep  # An iteration of `admm` costs as much as two sweeps.
         if p.generalized is not None:

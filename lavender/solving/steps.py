@@ -59,21 +59,29 @@ class Step:
     impulse: FloatArray  # Present iterate (m,) [N s].
 
     def __init__(self, name: str, log: SolveLog, tree: Any) -> None:
-        self.name, self.log, self.is_large = name, log, tree.is_large
+        self.name = name
+        self.log = log
+        self.is_large = tree.is_large
         self.solver = make_solver(name, log.problem)
         if self.name.startswith("newton"):
             self.analysed, self.started_from_zero = tree.newton_state, tree.started_from_zero
 
     def run(self, n: float) -> None:
         """Run at most n iterations and record the stage in the log."""
-        log, before = self.log, self.log.best
+        log = self.log
+        before = self.log.best
         try:
             # Counts of kernels have 32 bits.
             claim = self.advance(int(min(max(n, 1.0), log.remaining_iterations, 2**30)))
-            if log.recorder is not None and not isinstance(self, Iterations):  # Their loop makes records.
-                log.recorder.record_impulse(self.name, log.iterations + claim.iterations, self.impulse)
+            if log.recorder is not None and not isinstance(
+                self, Iterations
+            ):  # Their loop makes records.
+                log.recorder.record_impulse(
+                    self.name, log.iterations + claim.iterations, self.impulse
+                )
         except BREAKDOWN as error:
-            log.failure, self.over = format_error(error), True
+            log.failure = format_error(error)
+            self.over = True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
         self.late = claim.status is Status.TIME_LIMIT
@@ -84,7 +92,8 @@ class Step:
         """Run at most n iterations and offer the result to the log."""
         log = self.log
         if self.state is None:
-            self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
+            self.state = self.solver.prepare(log.problem)
+            self.impulse = log.impulse.copy()
         claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
         self.store_iterate_in_log(claim.judged)
         return claim
@@ -107,7 +116,8 @@ class Newton(Step):
 
     def run(self, n: float) -> None:
         """Run at most n iterations, with a second start from zero and over rows of A if the method stalls."""
-        log, end = self.log, self.log.iterations + n
+        log = self.log
+        end = self.log.iterations + n
         super().run(n)
         if self.has_stalled and not self.started_from_zero and not log.done():
             self.started_from_zero = self.is_second_start = True
@@ -117,26 +127,40 @@ class Newton(Step):
             continuation = self.solver.prepare_continuation(self.state)
             if continuation is not None:
                 # As in Newton's method by name, a bad start is replaced by the zero impulse.
-                self.state, self.is_second_start = continuation, not log.best <= WARM_START_MAX_RESIDUAL
+                self.state = continuation
+                self.is_second_start = not log.best <= WARM_START_MAX_RESIDUAL
                 self.over = False
                 super().run(end - log.iterations)
 
     def advance(self, n: int) -> Claim:
         """Run about n iterations, on large problems with friction more; choose the start at the first call."""
-        log, is_large, done, work = self.log, self.is_large, 0, dict[str, int]()
+        log = self.log
+        is_large = self.is_large
+        done = 0
+        work = dict[str, int]()
         extension = int(DECISIONS.turn_extension)
         self.state = self.state or self.analysed
         if not self.state.begun:
             self.impulse = log.problem.start() if self.is_second_start else log.impulse.copy()
-            self.started_from_zero = self.started_from_zero or not (self.impulse - log.problem.start()).any()
+            self.started_from_zero = (
+                self.started_from_zero or not (self.impulse - log.problem.start()).any()
+            )
         count = max(1, n - extension) if is_large else n
         while True:
-            before, left = log.best, log.remaining_iterations - done
-            claim = self.solver.advance(self.state, self.impulse, count, log.tol, log.time_left, left)
+            before = log.best
+            left = log.remaining_iterations - done
+            claim = self.solver.advance(
+                self.state, self.impulse, count, log.tol, log.time_left, left
+            )
             self.store_iterate_in_log(claim.judged)
-            done, work = done + claim.iterations, sum_work_counts((work, claim.work))
+            done = done + claim.iterations
+            work = sum_work_counts((work, claim.work))
             is_slow = not is_large or (done >= n and log.best > 0.5 * before)
-            if is_slow or claim.status is not Status.MAX_ITERATIONS or done >= log.remaining_iterations:
+            if (
+                is_slow
+                or claim.status is not Status.MAX_ITERATIONS
+                or done >= log.remaining_iterations
+            ):
                 break
             count = extension
         self.has_stalled = claim.status is Status.STALLED
@@ -152,13 +176,21 @@ class RelaxedNewton(Step):
         if self.state is None:  # The elimination order of the problem's own state is reused.
             self.state = self.solver.update(self.analysed, get_relaxation(log.problem))
             self.impulse = log.problem.start()
-        system, trial, slips = self.state.system, self.impulse.copy(), False
-        claim, done, work = Claim(Status.MAX_ITERATIONS, 0), 0, dict[str, int]()
+        system = self.state.system
+        trial = self.impulse.copy()
+        slips = False
+        claim = Claim(Status.MAX_ITERATIONS, 0)
+        done = 0
+        work = dict[str, int]()
         count = min(n, int(DECISIONS.relaxed_start)) if system is not None else n
         while done < n and claim.status is Status.MAX_ITERATIONS:
             tol = DECISIONS.relaxed_tol * log.tol
-            claim = self.solver.advance(self.state, self.impulse, count, tol, log.time_left, n - done)
-            done, work, count = done + claim.iterations, sum_work_counts((work, claim.work)), 1
+            claim = self.solver.advance(
+                self.state, self.impulse, count, tol, log.time_left, n - done
+            )
+            done = done + claim.iterations
+            work = sum_work_counts((work, claim.work))
+            count = 1
             if claim.status is not Status.MAX_ITERATIONS or system is None:
                 self.store_iterate_in_log()
                 break
@@ -185,16 +217,22 @@ class Iterations(Step):
 
     def advance(self, n: int) -> Claim:
         """Run at most n iterations and offer the last and the best iterate to the log."""
-        log, left = self.log, self.log.deadline.get_remaining_seconds()
+        log = self.log
+        left = self.log.deadline.get_remaining_seconds()
         restarts = self.name == "admm" and self.is_large
         if self.state is None or (restarts and log.best < self.state.best[0]):
             self.prepare_and_set_start()
         is_whole = left is None or self.time_fraction == 1.0
         deadline = log.deadline if is_whole else Deadline(self.time_fraction * left)
         loop = Loop(
-            problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
-            deadline=None if left is None else deadline, records=None if log.recorder is None else [],
-        )  # fmt: skip
+            problem=log.problem,
+            solver=self.solver,
+            state=self.state,
+            impulse=self.impulse,
+            tol=log.tol,
+            deadline=None if left is None else deadline,
+            records=None if log.recorder is None else [],
+        )
         begun = 0.0 if log.recorder is None else log.recorder.time
         claim = self.run_loop(loop, n)
         if log.recorder is not None:
@@ -208,12 +246,16 @@ class Iterations(Step):
 
     def prepare_and_set_start(self) -> None:
         """Prepare the solver and start from the best impulse of the log, zero, or the relaxation's solution."""
-        log, start = self.log, self.log.impulse
-        if self.name == "admm from zero":  # On large piles, it needs fewer iterations than from sweeps.
+        log = self.log
+        start = self.log.impulse
+        if (
+            self.name == "admm from zero"
+        ):  # On large piles, it needs fewer iterations than from sweeps.
             start = log.problem._start
         elif self.name == "admm" and self.state is None and log.relaxed is not None:
             start = log.relaxed
-        self.state, self.impulse = self.solver.prepare(log.problem), start.copy()
+        self.state = self.solver.prepare(log.problem)
+        self.impulse = start.copy()
 
     def run_loop(self, loop: Loop, n: int) -> Claim:
         """Run at most n iterations."""
@@ -253,9 +295,13 @@ class Sweeps(Iterations):
         """Run at most n sweeps; predict how many remain at intervals."""
         is_large, log = self.is_large, self.log
         first = int(DECISIONS.large_sweeps if is_large else DECISIONS.first_sweeps)
-        growth, tol = 1.0 if is_large else 0.5, max(log.tol, DECISIONS.predicted_residual)
-        done, due = self.state.watch.total, 0
-        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps: run these without.
+        growth = 1.0 if is_large else 0.5
+        tol = max(log.tol, DECISIONS.predicted_residual)
+        done = self.state.watch.total
+        due = 0
+        if (
+            self.time_fraction == 1.0
+        ):  # Checks would cost as much as the first sweeps: run these without.
             loop.tol = 0.0
             claim = loop.run_chunks(min(n, first))
             if claim.status is not Status.MAX_ITERATIONS:
@@ -272,14 +318,17 @@ class Sweeps(Iterations):
                 return replace(claim, status=Status.MAX_ITERATIONS)
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
-            before, now = now, float(self.state.best[0])
+            before = now
+            now = float(self.state.best[0])
             if not is_large:  # Sweeps of large problems take as long as a pass of the judge.
                 self.store_iterate_in_log()
                 now = log.best
             elif self.n_islands != 1:
                 island_of_block, table = residuals_by_island(log.problem.metric, self.impulse)
                 self.n_islands = len(table)
-                if np.mean(table[island_of_block, 0] <= log.tol) >= 0.5:  # The other islands continue alone.
+                if (
+                    np.mean(table[island_of_block, 0] <= log.tol) >= 0.5
+                ):  # The other islands continue alone.
                     return claim
             self.predicted = inf
             self.predict(step, before, now)
@@ -295,5 +344,8 @@ class Sweeps(Iterations):
 
 #: Class of the step of each solver; the other solvers have `Iterations`.
 STEP_CLASSES = {
-    "anderson": Sweeps, "direct": Step, "newton": Newton, "newton on the relaxation": RelaxedNewton,
-}  # fmt: skip
+    "anderson": Sweeps,
+    "direct": Step,
+    "newton": Newton,
+    "newton on the relaxation": RelaxedNewton,
+}

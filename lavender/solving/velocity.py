@@ -29,7 +29,9 @@ def check_velocity_tolerance(velocity_tol: float, tol: float) -> float:
     """Return `velocity_tol` [m/s] as a float."""
     velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
     if tol != DEFAULT_TOLERANCE:
-        raise InputError(f"tol is {tol:g} and velocity_tol is {velocity_tol:g}; one of them is needed alone")
+        raise InputError(
+            f"tol is {tol:g} and velocity_tol is {velocity_tol:g}; one of them is needed alone"
+        )
     return velocity_tol
 
 

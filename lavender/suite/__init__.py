@@ -17,7 +17,14 @@ from collections.abc import Iterator
 
 from lavender.base.errors import UnknownName
 from lavender.suite import friction, hard
-from lavender.suite.case import FAMILIES, MAX_SIZE, Case, Reference, format_parameter_value, parse_case_name
+from lavender.suite.case import (
+    FAMILIES,
+    MAX_SIZE,
+    Case,
+    Reference,
+    format_parameter_value,
+    parse_case_name,
+)
 from lavender.suite.families import (
     box_stack,
     boxed_friction,
@@ -38,18 +45,58 @@ from lavender.suite.steps import (
 )
 
 __all__ = [
-    "FAMILIES", "MAX_SIZE", "SETS", "Case", "Reference", "box_stack", "boxed_friction", "case", "cases",
-    "chain", "default", "engine_step", "explain_missing_packages", "families", "friction", "get_case_names_of_set",
-    "granular", "hang", "hard", "parse_case_name", "pyramid",
-    "random_spd", "robot", "stack", "toy_stack", "two_particles", "walking",
-]  # fmt: skip
+    "FAMILIES",
+    "MAX_SIZE",
+    "SETS",
+    "Case",
+    "Reference",
+    "box_stack",
+    "boxed_friction",
+    "case",
+    "cases",
+    "chain",
+    "default",
+    "engine_step",
+    "explain_missing_packages",
+    "families",
+    "friction",
+    "get_case_names_of_set",
+    "granular",
+    "hang",
+    "hard",
+    "parse_case_name",
+    "pyramid",
+    "random_spd",
+    "robot",
+    "stack",
+    "toy_stack",
+    "two_particles",
+    "walking",
+]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 
 # Models of each package in the set "robots".
 ROBOTS = {
-    "gymnasium": ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "pusher_v5", "walker2d_v5"),
-    "dm_control": ("cheetah", "dog", "humanoid", "humanoid_CMU", "manipulator", "quadruped", "stacker", "walker"),
-}  # fmt: skip
+    "gymnasium": (
+        "ant",
+        "half_cheetah",
+        "hopper",
+        "humanoid",
+        "humanoidstandup",
+        "pusher_v5",
+        "walker2d_v5",
+    ),
+    "dm_control": (
+        "cheetah",
+        "dog",
+        "humanoid",
+        "humanoid_CMU",
+        "manipulator",
+        "quadruped",
+        "stacker",
+        "walker",
+    ),
+}
 
 #: Sets of cases by name. `lavender report` without files runs "default": one case for each property that separates
 #: solvers, small enough for all of them.
@@ -66,7 +113,12 @@ SETS: dict[str, tuple[str, ...]] = {
     "large": (
         *("granularF(n=6)", "granularF(n=6, sliding=0.5)", "granularF(n=6, sliding=2, seed=4)"),
         *("wall(n=10)", "wall(n=10, sliding=0.5)", "pyramidF(k=16)", "pyramidF(k=16, sliding=0.5)"),
-        *("granularF(n=11)", "granularF(n=11, sliding=0.5)", "pyramidF(k=40)", "pyramidF(k=40, sliding=0.5)"),
+        *(
+            "granularF(n=11)",
+            "granularF(n=11, sliding=0.5)",
+            "pyramidF(k=40)",
+            "pyramidF(k=40, sliding=0.5)",
+        ),
         *("wall(n=25)", "wall(n=25, sliding=0.1)", "wall(n=25, sliding=0.5)"),
     ),
     "engine": tuple(
@@ -115,7 +167,9 @@ def case(text: str) -> Case:
     if name not in FAMILIES:
         raise UnknownName("case", name, [*FAMILIES, *SETS])
     family = FAMILIES[name]
-    known = [parameter for parameter in family.signature.parameters if parameter not in family.preset]
+    known = [
+        parameter for parameter in family.signature.parameters if parameter not in family.preset
+    ]
     for parameter in values:
         if parameter not in known:
             raise UnknownName(f"parameter of {name}", parameter, known)

@@ -30,7 +30,9 @@ class Bodies:
 
     def __init__(self, position: Any, mass: Any, inertia_per_mass: Any) -> None:
         self.position = np.asarray(position, float).reshape(-1, 3)  # (n, 3) m
-        self.mass = np.broadcast_to(np.asarray(mass, float), (len(self.position),)).copy()  # (n,) kg
+        self.mass = np.broadcast_to(
+            np.asarray(mass, float), (len(self.position),)
+        ).copy()  # (n,) kg
         self.inertia = np.multiply.outer(self.mass, inertia_per_mass)  # (n,) or (n, 3) kg m^2
         self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
         self.v_free[:, 2] = -FALL_SPEED
@@ -56,7 +58,9 @@ class Contacts:
     def __init__(self, body: Any, point: Any, normal: Any) -> None:
         self.body: IntArray = np.asarray(body, np.int32).reshape(-1, 2)
         self.point: FloatArray = np.asarray(point, float).reshape(-1, 3)
-        self.normal: FloatArray = np.broadcast_to(np.asarray(normal, float), self.point.shape).copy()
+        self.normal: FloatArray = np.broadcast_to(
+            np.asarray(normal, float), self.point.shape
+        ).copy()
 
     def compute_arms(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Compute the arms from the centres of a and b to the points, (c, 3) each [m]; zero for the ground."""
@@ -74,11 +78,18 @@ class Contacts:
 
 
 def build_contact_problem(
-    bodies: Bodies, contacts: Contacts, friction: str = "none", mu: Any = 0.5, target: Any = 0.0, **more: Any
+    bodies: Bodies,
+    contacts: Contacts,
+    friction: str = "none",
+    mu: Any = 0.5,
+    target: Any = 0.0,
+    **more: Any,
 ) -> Problem:
     """Build a problem of contacts without friction, or with two tangents under the law "coulomb" or "cone"."""
     if friction not in CONTACT_FRICTION_LAWS:
-        raise InputError(f"friction is {friction!r}; {' or '.join(CONTACT_FRICTION_LAWS)} is needed")
+        raise InputError(
+            f"friction is {friction!r}; {' or '.join(CONTACT_FRICTION_LAWS)} is needed"
+        )
     rows = bodies.make_rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)
@@ -90,7 +101,9 @@ def build_joint_problem(
 ) -> Problem:
     """Build a problem of joints of `size` rows each: jac (k size, 12), body (k, 2)."""
     ptr = np.arange(0, len(jac) + 1, size, dtype=np.int32)
-    rows = bodies.make_rows(jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32))
+    rows = bodies.make_rows(
+        jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32)
+    )
     return Problem.from_rows(rows, target, **more)
 
 

@@ -21,7 +21,9 @@ from lavender.problem.derived import cached_property
 
 P = ParamSpec("P")
 CASE_NAME = re.compile(r"\s*(\w+)\s*(?:\(([^()]*)\))?\s*")
-MAX_SIZE = 10**7  # Larger integer parameters are rejected: they are typing errors and would fill the memory.
+MAX_SIZE = (
+    10**7
+)  # Larger integer parameters are rejected: they are typing errors and would fill the memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,9 @@ class Family:
 FAMILIES: dict[str, Family] = {}
 
 
-def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
+def register_family(
+    **aliases: Mapping[str, Any],
+) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
     """Register a function under its name, and under aliases with some parameters fixed."""
 
     def decorate(function: Callable[P, Draft]) -> Callable[P, Case]:
@@ -142,20 +146,29 @@ def register_family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft
             bound = signature.bind(*args, **kwargs)
             explicit = frozenset(bound.arguments)
             bound.apply_defaults()
-            known, given_values = signature.parameters, bound.arguments.items()
+            known = signature.parameters
+            given_values = bound.arguments.items()
             values = {n: _convert_parameter(name, known[n], v) for n, v in given_values}
             text = _format_case_name(name, values, explicit)
             try:
                 draft = function(**values)  # type: ignore[call-arg]
             except MemoryError:
-                raise InputError(f"{text}: there is not enough memory; give smaller parameters") from None
+                raise InputError(
+                    f"{text}: there is not enough memory; give smaller parameters"
+                ) from None
             return Case(
-                name=text, problem=replace(draft.problem, name=text, copy=False), reason=draft.reason, family=name,
-                parameters=MappingProxyType(values), solve_reference=draft.reference,
-            )  # fmt: skip
+                name=text,
+                problem=replace(draft.problem, name=text, copy=False),
+                reason=draft.reason,
+                family=name,
+                parameters=MappingProxyType(values),
+                solve_reference=draft.reference,
+            )
 
         for alias, preset in {name: {}, **aliases}.items():
-            FAMILIES[alias] = Family(alias, make, signature, MappingProxyType(dict(preset)), summary)
+            FAMILIES[alias] = Family(
+                alias, make, signature, MappingProxyType(dict(preset)), summary
+            )
         return make
 
     return decorate
@@ -179,11 +192,17 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
 
 def _format_case_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
     """Return the canonical name of a case; it has the parameters that are `explicit` or differ from their defaults."""
-    best, preset = name, FAMILIES[name].preset
+    best = name
+    preset = FAMILIES[name].preset
     for alias in FAMILIES.values():
         fixed = alias.preset
-        if alias.make.__name__ == name and fixed and all(values.get(n) == v for n, v in fixed.items()):
-            best, preset = alias.name, fixed
+        if (
+            alias.make.__name__ == name
+            and fixed
+            and all(values.get(n) == v for n, v in fixed.items())
+        ):
+            best = alias.name
+            preset = fixed
     parameters = FAMILIES[name].signature.parameters
     own = {n: v for n, v in values.items() if n in explicit or v != parameters[n].default}
     shown = [f"{n}={format_parameter_value(v)}" for n, v in own.items() if n not in preset]
@@ -195,7 +214,11 @@ def format_parameter_value(value: Any) -> str:
     if not isinstance(value, float):
         return str(value)
     mantissa, _, exponent = f"{value:.16e}".partition("e")
-    spellings = [repr(value), f"{value:.17g}", f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"]
+    spellings = [
+        repr(value),
+        f"{value:.17g}",
+        f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}",
+    ]
     mantissa, _, exponent = repr(value).partition("e")
     if exponent:
         spellings.append(f"{mantissa}e{int(exponent)}")
@@ -215,7 +238,9 @@ def parse_case_name(text: str) -> tuple[str, dict[str, Any]]:
     parameters = [part.partition("=") for part in body.split(",")] if body else []
     values = {name.strip(): _parse_value(value.strip()) for name, _, value in parameters}
     if match is None or len(values) < len(parameters) or "" in values or None in values.values():
-        raise InputError(f"{text!r} is not a case, such as toy_stack or pyramid(k=10, mass_ratio=1e6)")
+        raise InputError(
+            f"{text!r} is not a case, such as toy_stack or pyramid(k=10, mass_ratio=1e6)"
+        )
     return match[1], values
 
 

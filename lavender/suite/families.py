@@ -32,7 +32,10 @@ from lavender.suite.case import Draft, Reference, register_family
 WITH_FRICTION = {"friction": "coulomb"}
 FRICTION_COEFFICIENT = 0.5
 # Moment of inertia divided by mass of each kind of body [m^2].
-SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1
+SPHERE = 0.1
+BOX = 1.0 / 6.0
+PEBBLE = 0.1
+ROD = 0.1
 
 
 def check_min_sizes(minimum: int, **sizes: int) -> None:
@@ -53,7 +56,9 @@ def check_positive(**values: float) -> None:
 
 
 @register_family(stackF=WITH_FRICTION)
-def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
+def stack(
+    n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0
+) -> Draft:
     """n spheres in a column, one contact between neighbours; the top one weighs `mass_ratio` times the others.
 
     A is tridiagonal with condition number near n^2 (times a factor of mass_ratio). Without friction and after one step
@@ -82,7 +87,9 @@ def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding:
 
 
 @register_family(box_stackF=WITH_FRICTION)
-def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
+def box_stack(
+    n: int = 10, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0
+) -> Draft:
     """n unit cubes on four points each; the top one weighs `mass_ratio` times the others.
 
     Four normals of one face have rank 3 (twelve rows with friction have rank 6): impulses are not unique,
@@ -90,16 +97,16 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
     """
     bodies, contacts = _build_cube_column(n, mass_ratio)
     problem = _build_box_problem(bodies, contacts, friction, sliding)
-    reason = (
-        "redundant: four points where three would do, so A is singular; heavy on light makes sweeps stall"
-    )
+    reason = "redundant: four points where three would do, so A is singular; heavy on light makes sweeps stall"
     if friction != "none":
         return Draft(problem, reason)
 
     def closed_form() -> Reference:
         load = FALL_SPEED * np.cumsum(bodies.mass[::-1])[::-1]
         return Reference(
-            np.repeat(0.25 * load, 4), "closed form: the weight above, a quarter on each point", "slack"
+            np.repeat(0.25 * load, 4),
+            "closed form: the weight above, a quarter on each point",
+            "slack",
         )
 
     return Draft(problem, reason, closed_form)
@@ -133,7 +140,9 @@ def pyramid(
     return Draft(problem, reason)
 
 
-def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
+def _build_cube_pyramid(
+    k: int, mass_ratio: float, bottom_ratio: float = 1.0
+) -> tuple[Bodies, Contacts]:
     """Build the bodies and contacts of a pyramid of unit cubes."""
     check_min_sizes(1, k=k)
     check_positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
@@ -148,10 +157,12 @@ def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) ->
     above = np.flatnonzero(row > 0)
     left = first[row[above] - 1] + column[above]
     # First the ground contacts, then for every other box its left and its right support.
-    pairs = np.concatenate([
-        np.stack([np.full(k, -1), np.arange(k)], 1),
-        np.stack([np.stack([left, left + 1], 1).ravel(), np.repeat(above, 2)], 1),
-    ])  # fmt: skip
+    pairs = np.concatenate(
+        [
+            np.stack([np.full(k, -1), np.arange(k)], 1),
+            np.stack([np.stack([left, left + 1], 1).ravel(), np.repeat(above, 2)], 1),
+        ]
+    )
     a, b = pairs.T
     low = np.where(a < 0, x[b], np.maximum(x[np.maximum(a, 0)], x[b])) - 0.5
     high = np.where(a < 0, x[b], np.minimum(x[np.maximum(a, 0)], x[b])) + 0.5
@@ -159,7 +170,9 @@ def _build_cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) ->
     return bodies, place_corner_contacts(pairs, centre, 0.5 * (high - low))
 
 
-def _build_box_problem(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
+def _build_box_problem(
+    bodies: Bodies, contacts: Contacts, friction: str, sliding: float
+) -> Problem:
     """Build a problem of boxes; with friction, some contacts slide and some lift."""
     if friction != "none":
         _add_random_velocity(bodies)
@@ -169,7 +182,9 @@ def _build_box_problem(bodies: Bodies, contacts: Contacts, friction: str, slidin
 
 def _add_random_velocity(bodies: Bodies) -> None:
     """Add a small random velocity to every body."""
-    bodies.v_free += 0.05 * np.random.default_rng(3).standard_normal(bodies.v_free.size).reshape(-1, 6)
+    bodies.v_free += 0.05 * np.random.default_rng(3).standard_normal(bodies.v_free.size).reshape(
+        -1, 6
+    )
 
 
 # -- piles ----------------------------------------------------------------------------------------
@@ -212,7 +227,14 @@ def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
         return np.where(ok, to @ step, -1).tolist()
 
     ground = np.stack(
-        [grid[:, 0] == 0, grid[:, 0] == n - 1, grid[:, 1] == 0, grid[:, 1] == n - 1, grid[:, 2] == 0], 1
+        [
+            grid[:, 0] == 0,
+            grid[:, 0] == n - 1,
+            grid[:, 1] == 0,
+            grid[:, 1] == n - 1,
+            grid[:, 2] == 0,
+        ],
+        1,
     )
     # A site that touches both of two opposite walls (n = 1) has one contact along that axis.
     ground[:, 1] &= ~ground[:, 0]
@@ -239,12 +261,14 @@ def _build_pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
             body += [(-1, a)] * len(walls)
             wall += walls
     flat = np.concatenate(draws) if draws else np.zeros(0)
-    pair, side = np.array(body, np.int32).reshape(-1, 2), np.array(wall, np.int32)
+    pair = np.array(body, np.int32).reshape(-1, 2)
+    side = np.array(wall, np.int32)
     between = side < 0
     start = np.concatenate([[0], np.cumsum(np.where(between, 6, 3))])[:-1]
     jitter = flat[start[:, None] + np.arange(3)]
     second = flat[np.minimum(start[:, None] + 3, len(flat) - 3) + np.arange(3)]
-    first_body, second_body = np.maximum(pair[:, 0], 0), pair[:, 1]
+    first_body = np.maximum(pair[:, 0], 0)
+    second_body = pair[:, 1]
     separation = position[second_body] - position[first_body]
     separation /= np.where(between, np.linalg.norm(separation, axis=1), 1.0)[:, None]
     separation += 0.25 * jitter
@@ -274,11 +298,13 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     check_positive(tip_mass=tip_mass)
     k = np.arange(n)
     link = np.stack(
-        [0.8 + 0.0 * k, 0.3 * map_scalar(math.cos, k), -0.5 + 0.3 * map_scalar(math.sin, 1.7 * k)], 1
+        [0.8 + 0.0 * k, 0.3 * map_scalar(math.cos, k), -0.5 + 0.3 * map_scalar(math.sin, 1.7 * k)],
+        1,
     )
     problem = _build_chain(link, tip_mass, 0.02)  # pyright: ignore[reportArgumentType]
     return Draft(
-        problem, "bilateral and banded with little tension: easy for every solver that uses the band"
+        problem,
+        "bilateral and banded with little tension: easy for every solver that uses the band",
     )
 
 
@@ -291,10 +317,13 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
     check_min_sizes(1, n=n)
     check_positive(tip_mass=tip_mass)
     k = np.arange(n)
-    link = np.stack([1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
+    link = np.stack(
+        [1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1
+    )
     problem = _build_chain(link, tip_mass, 1e-4)  # pyright: ignore[reportArgumentType]
     return Draft(
-        problem, "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n"
+        problem,
+        "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
     )
 
 
@@ -314,7 +343,9 @@ def _build_chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
     )
 
 
-def compute_ball_joint_jacobian(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> FloatArray:
+def compute_ball_joint_jacobian(
+    position: FloatArray, body: np.ndarray, anchor: FloatArray
+) -> FloatArray:
     """Compute the Jacobian (3 k, 12) of ball joints: the anchors on bodies a and b have the same velocity."""
     k = len(body)
     jac = np.zeros((k, 3, 12))
@@ -331,7 +362,9 @@ def compute_ball_joint_jacobian(position: FloatArray, body: np.ndarray, anchor: 
 
 def multiply_in_index_order(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute a @ b, summed in the order of the index: unlike BLAS, it has the same bits on every processor."""
-    return np.asarray(sum(np.multiply.outer(column, row) for column, row in zip(a.T, b, strict=True)))
+    return np.asarray(
+        sum(np.multiply.outer(column, row) for column, row in zip(a.T, b, strict=True))
+    )
 
 
 @register_family()
@@ -358,7 +391,9 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
     return Draft(
         problem,
         "one row, one number: everything can be computed by hand",
-        lambda: Reference(np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)"),
+        lambda: Reference(
+            np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)"
+        ),
     )
 
 
@@ -402,19 +437,23 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
     # Round each eigenvalue to twelve digits, so that the last bits of the C library's pow do not matter.
-    a = np.zeros((n, n))  # Allocated before the eigenvalues are computed, because it may not fit into memory.
+    a = np.zeros(
+        (n, n)
+    )  # Allocated before the eigenvalues are computed, because it may not fit into memory.
     np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
     # Rotate in random planes until every vector has a component along every other.
     for _ in range(4 * n.bit_length()):
         i, j = rng.permutation(n)[: n - n % 2].reshape(2, -1)
         t = rng.uniform(-1.0, 1.0, (len(i), 1))
-        c, s = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)
+        c = (1.0 - t * t) / (1.0 + t * t)
+        s = 2.0 * t / (1.0 + t * t)
         for view in (a, a.T):
             view[i], view[j] = c * view[i] - s * view[j], s * view[i] + c * view[j]
     a = 0.5 * (a + a.T)
     problem = Problem.linear(a, multiply_in_index_order(a, rng.standard_normal(n)))
     return Draft(
-        problem, "no structure, only a condition number, which separates direct from iterative solvers"
+        problem,
+        "no structure, only a condition number, which separates direct from iterative solvers",
     )
 
 
@@ -446,17 +485,29 @@ def boxed_friction(
 def _build_boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:
     """Build a block of bounded rows n, t1, t2 for each contact; the tangents' bounds are mu times the static load."""
     arm_a, arm_b = contacts.compute_arms(bodies.position)
-    n, t = contacts.normal, contacts.compute_tangents()
+    n = contacts.normal
+    t = contacts.compute_tangents()
     axes = np.stack([n, t, np.cross(n, t)], 1)  # Shape (c, 3, 3).
     moving = (contacts.body >= 0).astype(float)[:, :, None, None]
-    jac = np.concatenate([
-        -axes * moving[:, 0], -np.cross(arm_a[:, None], axes) * moving[:, 0],
-        axes * moving[:, 1], np.cross(arm_b[:, None], axes) * moving[:, 1],
-    ], axis=2)  # fmt: skip
+    jac = np.concatenate(
+        [
+            -axes * moving[:, 0],
+            -np.cross(arm_a[:, None], axes) * moving[:, 0],
+            axes * moving[:, 1],
+            np.cross(arm_b[:, None], axes) * moving[:, 1],
+        ],
+        axis=2,
+    )
     bound = FRICTION_COEFFICIENT * guess_static_loads(bodies, contacts)
     high = np.stack([np.full(len(n), np.inf), bound, bound], 1)
     low = np.stack([np.zeros(len(n)), -bound, -bound], 1)
     names = [f"contact {i}" for i in range(len(n))]
     return build_joint_problem(
-        bodies, contacts.body, jac.reshape(-1, 12), 3, lower=low.ravel(), upper=high.ravel(), names=names
+        bodies,
+        contacts.body,
+        jac.reshape(-1, 12),
+        3,
+        lower=low.ravel(),
+        upper=high.ravel(),
+        names=names,
     )

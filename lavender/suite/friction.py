@@ -23,7 +23,9 @@ from lavender.suite.families import BOX, check_min_sizes, check_positive
 
 
 @register_family()
-def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb") -> Draft:
+def slider(
+    mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb"
+) -> Draft:
     """A point mass sliding across the slope of a ramp of `angle` [degrees]: one contact, solved by hand.
 
     Coulomb: lambda_n = m g h cos angle; it sticks if mu lambda_n >= m |v_t|, otherwise friction opposes v_t. The
@@ -63,20 +65,26 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
     )
 
     def closed_form() -> Reference:
-        n, t = FALL_SPEED * math.cos(a), min(FALL_SPEED * math.sin(a), mu * FALL_SPEED * math.cos(a))
+        n = FALL_SPEED * math.cos(a)
+        t = min(FALL_SPEED * math.sin(a), mu * FALL_SPEED * math.cos(a))
         # Friction t at the bottom face tips the cube forwards with the lever 1/2: each front point carries n/4 + t/4.
-        rear, front = 0.25 * n - 0.25 * t, 0.25 * n + 0.25 * t
+        rear = 0.25 * n - 0.25 * t
+        front = 0.25 * n + 0.25 * t
         normal = np.array([rear, rear, front, front])
         along = problem.rows.tangent @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
         across = np.cross(problem.rows.normal, problem.rows.tangent) @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
         friction_per_normal = -t * normal / n
         return Reference(
-            np.stack([normal, friction_per_normal * along, friction_per_normal * across], 1).ravel(),
+            np.stack(
+                [normal, friction_per_normal * along, friction_per_normal * across], 1
+            ).ravel(),
             "closed form",
             "slack",
         )
 
-    return Draft(problem, "sticks below tan angle = mu, slides above, on a redundant face", closed_form)
+    return Draft(
+        problem, "sticks below tan angle = mu, slides above, on a redundant face", closed_form
+    )
 
 
 @register_family()
@@ -94,7 +102,9 @@ def threshold(above: float = 0.0) -> Draft:
         scale = min(1.0, 0.5 * b[0] / size)
         return Reference(np.array([b[0], scale * b[1], scale * b[2]]), "closed form")
 
-    return Draft(problem, "at the edge of the disk, where the projection is not differentiable", closed_form)
+    return Draft(
+        problem, "at the edge of the disk, where the projection is not differentiable", closed_form
+    )
 
 
 @register_family()
@@ -121,12 +131,17 @@ def _solve_secular_equation(b: FloatArray, ratio: float) -> FloatArray:
     """
     from scipy.optimize import brentq
 
-    radius, mass = 0.5 * b[0], np.array([1.0, ratio])
+    radius = 0.5 * b[0]
+    mass = np.array([1.0, ratio])
     if np.hypot(*(b[1:] / mass)) <= radius:
         return np.append(b[0], b[1:] / mass)
     upper_limit = float(np.hypot(*b[1:])) / radius
     s = brentq(
-        lambda s: np.hypot(*(b[1:] / (mass + s))) - radius, 0.0, upper_limit, xtol=1e-300, rtol=2.0**-50
+        lambda s: np.hypot(*(b[1:] / (mass + s))) - radius,
+        0.0,
+        upper_limit,
+        xtol=1e-300,
+        rtol=2.0**-50,
     )
     return np.append(b[0], b[1:] / (mass + s))
 
@@ -165,9 +180,10 @@ def arch(n: int = 9, mu: float = 0.6) -> Draft:
     # Joint k has its normal along the arch; its corner points are at radii 4.5 and 5.5 m and y = -0.5 and 0.5 m.
     radius, side = (g.ravel() for g in np.meshgrid([4.5, 5.5], [-0.5, 0.5], indexing="ij"))
     along, up = map_scalar(math.cos, angle), map_scalar(math.sin, angle)
-    point = np.stack([
-        (-along[:, None] * radius).ravel(), np.tile(side, n + 1), (up[:, None] * radius).ravel()
-    ], 1)  # fmt: skip
+    point = np.stack(
+        [(-along[:, None] * radius).ravel(), np.tile(side, n + 1), (up[:, None] * radius).ravel()],
+        1,
+    )
     normal = np.repeat(np.stack([up, 0.0 * angle, along], 1), 4, axis=0)
     problem = build_contact_problem(
         bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu
@@ -201,7 +217,8 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
         cards = []
         for j in range(pairs):
             x = spacing * (j + 0.5 * level)
-            left, other = add(x - half - 0.5 * d, z + 0.5 * h), add(x + half + 0.5 * d, z + 0.5 * h)
+            left = add(x - half - 0.5 * d, z + 0.5 * h)
+            other = add(x + half + 0.5 * d, z + 0.5 * h)
             base = cards_below.get(j, -1)
             edge(base, left, x - half - d, z, up)
             edge(base, other, x + half + d, z, up)
@@ -216,7 +233,9 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
             cards_below[j] = across
     bodies = Bodies(position, 1.0, 0.1)
     a, b, point, normal = zip(*contacts, strict=True)
-    problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
+    problem = build_contact_problem(
+        bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu
+    )
     return Draft(problem, "held by friction only, over several levels")
 
 
@@ -232,12 +251,17 @@ def wall(n: int = 10, sliding: float = 0.0, mu: float = 0.6) -> Draft:
     contacts: list[tuple[int, int, list[float], list[float]]] = []
 
     def add_face_contacts(below: int, brick: int, x: float, z: float, half: float) -> None:
-        contacts.extend((below, brick, [x + half * s, 0.5 * t, z], [0.0, 0.0, 1.0]) for s, t in signs)
+        contacts.extend(
+            (below, brick, [x + half * s, 0.5 * t, z], [0.0, 0.0, 1.0]) for s, t in signs
+        )
 
     for course in range(n):
-        shift, first = course % 2, (course - 1) * n  # Number of the first brick below
+        shift = course % 2
+        first = (course - 1) * n  # Number of the first brick below
         for k in range(n):
-            x, z, brick = 2.0 * k + shift, float(course), course * n + k
+            x = 2.0 * k + shift
+            z = float(course)
+            brick = course * n + k
             position.append([x, 0.0, z + 0.5])
             if course == 0:
                 add_face_contacts(-1, brick, x, z, 1.0)
@@ -253,5 +277,7 @@ def wall(n: int = 10, sliding: float = 0.0, mu: float = 0.6) -> Draft:
     bodies = Bodies(position, 2.0, np.array([2.0, 5.0, 5.0]) / 12.0)
     add_horizontal_velocity(bodies, sliding)
     a, b, point, normal = zip(*contacts, strict=True)
-    problem = build_contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
+    problem = build_contact_problem(
+        bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu
+    )
     return Draft(problem, "many redundant contacts in two directions, of any size")

@@ -47,31 +47,57 @@ SET = (
     *(f"chain(n=33, tip_mass={r})" for r in ("1e4", "1e8")),
     *(f"hang(n=33, tip_mass={r})" for r in ("1", "1e4", "1e8")),
     # Long paths from the ground to the load.
-    "stack(n=10)", "stack(n=100)", "stack(n=1000)", "chain(n=1000)", "hang(n=100)", "hang(n=1000)", "hang(n=10000)",
+    "stack(n=10)",
+    "stack(n=100)",
+    "stack(n=1000)",
+    "chain(n=1000)",
+    "hang(n=100)",
+    "hang(n=1000)",
+    "hang(n=10000)",
     # Redundancy.
     *(f"duplicated(k={k})" for k in (2, 3, 8, 64)),
     *(f"slab(n={n})" for n in (2, 5, 10)),
     *(f"slabF(n={n}, sliding=0.5)" for n in (2, 10)),
-    "four_bar", "ring(n=8)", "ring(n=64)",
+    "four_bar",
+    "ring(n=8)",
+    "ring(n=64)",
     # Geometry.
     *(f"near_parallel(angle={a})" for a in ("0.01", "1e-4", "1e-7", "1e-12")),
     *(f"wedge(angle={a})" for a in ("0.1", "1e-4", "1e-8")),
     # Friction.
     *(f"slider(mu={mu})" for mu in ("0", "1e-12", "0.3", "1", "10")),
     *(f"slider(mu={mu}, friction=cone)" for mu in ("0.3", "10")),
-    *(f"ramp(angle={a})" for a in ("20", "30")), "threshold", "threshold(above=1e-9)", "threshold(above=-1e-9)",
+    *(f"ramp(angle={a})" for a in ("20", "30")),
+    "threshold",
+    "threshold(above=1e-9)",
+    "threshold(above=-1e-9)",
     *(f"anisotropic(ratio={r}, speed={s})" for r in ("10", "100", "1e6") for s in ("0.1", "3")),
-    "painleve", "painleve(slide=0.5)", "arch", "arch(n=25)", "card_house", "card_house(levels=5)",
-    "stackF(n=10, sliding=0.5)", "box_stackF(n=10, sliding=0.5)", "pyramidF(k=6, sliding=0.5)",
-    "pyramidF(k=6, mass_ratio=1e3, sliding=0.5)", "pyramidF(k=6, mass_ratio=1e6, sliding=0.5)",
-    "granularF(n=4, sliding=0.5)", "box_stackF(n=10, mass_ratio=1e6)",
+    "painleve",
+    "painleve(slide=0.5)",
+    "arch",
+    "arch(n=25)",
+    "card_house",
+    "card_house(levels=5)",
+    "stackF(n=10, sliding=0.5)",
+    "box_stackF(n=10, sliding=0.5)",
+    "pyramidF(k=6, sliding=0.5)",
+    "pyramidF(k=6, mass_ratio=1e3, sliding=0.5)",
+    "pyramidF(k=6, mass_ratio=1e6, sliding=0.5)",
+    "granularF(n=4, sliding=0.5)",
+    "box_stackF(n=10, mass_ratio=1e6)",
     # Special numbers.
     *(f"diagonal(kind={k})" for k in ("zero", "negative", "negligible")),
-    *(f"units(kg={k}, m={m}, s={s})" for k, m, s in (("1e12", 1, 1), ("1e-12", 1, 1), (1, "1e6", 1), (1, 1, "1e-6"))),
-    "least_speeds", *(f"degenerate_lcp(n={n})" for n in (8, 40)), "degenerate_lcp(n=40, asymmetric=1)",
+    *(
+        f"units(kg={k}, m={m}, s={s})"
+        for k, m, s in (("1e12", 1, 1), ("1e-12", 1, 1), (1, "1e6", 1), (1, 1, "1e-6"))
+    ),
+    "least_speeds",
+    *(f"degenerate_lcp(n={n})" for n in (8, 40)),
+    "degenerate_lcp(n=40, asymmetric=1)",
     *(f"random_spd(n=60, condition={c})" for c in ("100", "1e8", "1e14")),
-    "infeasible(kind=squeeze)", "infeasible(kind=joints)",
-)  # fmt: skip
+    "infeasible(kind=squeeze)",
+    "infeasible(kind=joints)",
+)
 
 
 # -- mass ratios and redundancy -------------------------------------------------------------------
@@ -84,7 +110,9 @@ def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 
     400 is the ratio of equal density in a plane.
     """
     check_positive(mass_ratio=mass_ratio)
-    bodies = Bodies([[-5.0, 0.0, 0.5], [5.0, 0.0, 0.5], [0.0, 0.0, 11.0]], [1.0, 1.0, mass_ratio], BOX)
+    bodies = Bodies(
+        [[-5.0, 0.0, 0.5], [5.0, 0.0, 0.5], [0.0, 0.0, 11.0]], [1.0, 1.0, mass_ratio], BOX
+    )
     bodies.inertia[2] *= 400.0
     add_horizontal_velocity(bodies, sliding)
     pairs = [[-1, 0], [-1, 1], [0, 2], [1, 2]]
@@ -121,7 +149,10 @@ def slab(n: int = 5, friction: str = "none", sliding: float = 0.0) -> Draft:
     bodies = Bodies([[0.1, 0.05, 0.2]], 10.0, 0.35)
     add_horizontal_velocity(bodies, sliding)
     problem = build_contact_problem(
-        bodies, Contacts(np.tile([-1, 0], (n * n, 1)), point, [0.0, 0.0, 1.0]), friction, FRICTION_COEFFICIENT
+        bodies,
+        Contacts(np.tile([-1, 0], (n * n, 1)), point, [0.0, 0.0, 1.0]),
+        friction,
+        FRICTION_COEFFICIENT,
     )
     return Draft(problem, "a body on many points: only three of them are needed")
 
@@ -169,7 +200,9 @@ def ring(n: int = 8) -> Draft:
     body[0, 0] = n - 1
     body = np.concatenate([body, [[-1, 0]]])
     at = np.concatenate([anchor[:-1], [anchor[0]]])
-    problem = build_joint_problem(bodies, body, compute_ball_joint_jacobian(bodies.position, body, at), 3)
+    problem = build_joint_problem(
+        bodies, body, compute_ball_joint_jacobian(bodies.position, body, at), 3
+    )
     return Draft(problem, "a loop of joints: the band of the chain closes on itself")
 
 
@@ -202,7 +235,9 @@ def wedge(angle: float = 1e-4) -> Draft:
         return Reference(impulse, "closed form: symmetric")
 
     return Draft(
-        problem, "opposed walls: impulses a million times the weight, A nearly singular", closed_form
+        problem,
+        "opposed walls: impulses a million times the weight, A nearly singular",
+        closed_form,
     )
 
 
@@ -237,7 +272,9 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
         impulse[::3] = 0.0  # 2^-60 times an integer would not be exact in b
         active[::3] = False
     slack = np.where(active, 0, rng.integers(1, 5, n)).astype(float)
-    problem = Problem.lcp(a, a @ impulse - slack)  # The product is exact: the numbers are small integers.
+    problem = Problem.lcp(
+        a, a @ impulse - slack
+    )  # The product is exact: the numbers are small integers.
     return Draft(
         problem,
         f"{kind} diagonal entries: legal, but a sweep cannot divide by them",
@@ -251,14 +288,20 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     check_positive(kg=kg, m=m, s=s)
     check_min_sizes(1, n=n)
     position, pairs, contact_point = place_tower(n)
-    bodies, contacts = Bodies(position, 1.0, BOX), place_corner_contacts(pairs, contact_point, 0.5)
+    bodies = Bodies(position, 1.0, BOX)
+    contacts = place_corner_contacts(pairs, contact_point, 0.5)
     arm_a, arm_b = contacts.compute_arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(
-        1.0 / (bodies.mass * kg), np.eye(3) / (BOX * kg * m * m) * np.ones((n, 1, 1)), bodies.v_free * speed,
-        normal=contacts.normal, tangent=contacts.compute_tangents(), arm_a=arm_a * m, arm_b=arm_b * m,
+        1.0 / (bodies.mass * kg),
+        np.eye(3) / (BOX * kg * m * m) * np.ones((n, 1, 1)),
+        bodies.v_free * speed,
+        normal=contacts.normal,
+        tangent=contacts.compute_tangents(),
+        arm_a=arm_a * m,
+        arm_b=arm_b * m,
         contact_body=contacts.body,
-    )  # fmt: skip
+    )
     problem = Problem.from_rows(rows)
 
     def closed_form() -> Reference:
@@ -294,7 +337,9 @@ def degenerate_lcp(n: int = 40, seed: int = 0, asymmetric: int = 0) -> Draft:
     if asymmetric:
         skew = np.triu(rng.integers(-3, 4, (n, n)), 1).astype(float)
         a += skew - skew.T
-    state = rng.integers(0, 3, n)  # 0: with an impulse, 1: separating, 2: touching without an impulse.
+    state = rng.integers(
+        0, 3, n
+    )  # 0: with an impulse, 1: separating, 2: touching without an impulse.
     impulse = np.where(state == 0, rng.integers(1, 9, n), 0).astype(float)
     slack = np.where(state == 1, rng.integers(1, 9, n), 0).astype(float)
     problem = Problem.lcp(a, a @ impulse - slack)
@@ -313,7 +358,9 @@ def infeasible(kind: str = "squeeze") -> Draft:
     """
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     if kind == "squeeze":
-        contacts = Contacts([[-1, 0], [-1, 0]], np.zeros((2, 3)), [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+        contacts = Contacts(
+            [[-1, 0], [-1, 0]], np.zeros((2, 3)), [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+        )
         problem = build_contact_problem(bodies, contacts, target=0.1)
         proof = np.array([1.0, 1.0])
     elif kind == "joints":

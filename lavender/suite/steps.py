@@ -39,7 +39,9 @@ def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
 
 
 @register_family()
-def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1, seed: int = 0) -> Draft:
+def walking(
+    n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1, seed: int = 0
+) -> Draft:
     """Predictive control of a walk: n jerks of the centre of mass that keep the centre of pressure inside the feet.
 
     min 1/2 |z - z_ref|^2 + 1/2 1e-4 |u|^2 over jerks u [m/s^3], z = c - (height/g) c'' the centre of pressure [m], in
@@ -49,9 +51,11 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
     check_positive(dt=dt, height=height, foot=foot)
     rng = np.random.default_rng([seed, 0x77616C6B])
     transition = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    jerk_effect, pressure = np.array([dt**3 / 6, dt * dt / 2, dt]), np.array([1.0, 0.0, -height / GRAVITY])
+    jerk_effect = np.array([dt**3 / 6, dt * dt / 2, dt])
+    pressure = np.array([1.0, 0.0, -height / GRAVITY])
     state = np.array([0.0, rng.normal(scale=0.2), 0.0])
-    free, by_jerk = np.empty(n), np.zeros((n, n))
+    free = np.empty(n)
+    by_jerk = np.zeros((n, n))
     by_each_jerk = np.zeros((3, n))  # Derivative of the state (c, c', c'') by each jerk.
     for k in range(n):
         state = multiply_in_index_order(transition, state)
@@ -66,14 +70,18 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
         G=np.vstack([by_jerk, -by_jerk]),
         h=np.concatenate([foot_centre + 0.5 * foot - free, free - foot_centre + 0.5 * foot]),
     )
-    return Draft(problem, "a quadratic program of control: dense rows in pairs, few of which are active")
+    return Draft(
+        problem, "a quadratic program of control: dense rows in pairs, few of which are active"
+    )
 
 
 # -- robots -----------------------------------------------------------------------------------------------
 
 
 @register_family()
-def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal", at: int = 200) -> Draft:
+def robot(
+    package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal", at: int = 200
+) -> Draft:
     """A MuJoCo model of gymnasium or dm_control after `at` steps under controls drawn by seed 0.
 
     The numbers depend on the versions of MuJoCo and of the package.
@@ -85,7 +93,9 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
     folder = Path(spec.submodule_search_locations[0]) / MODEL_FOLDERS[package]
     path = folder / f"{model}.xml"
     if not path.is_file():
-        raise UnknownName(f"model of {package}", model, sorted(p.stem for p in folder.glob("*.xml")))
+        raise UnknownName(
+            f"model of {package}", model, sorted(p.stem for p in folder.glob("*.xml"))
+        )
     check_name("cone", cone, tuple(MUJOCO_CONES))
     import mujoco
 
@@ -93,16 +103,25 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
 
     m = mujoco.MjModel.from_xml_path(str(path))
     m.opt.cone = MUJOCO_CONES[cone]
-    d, rng = mujoco.MjData(m), np.random.default_rng(0)
+    d = mujoco.MjData(m)
+    rng = np.random.default_rng(0)
     for _ in range(at):
         d.ctrl[:] = rng.uniform(-1.0, 1.0, m.nu)
         mujoco.mj_step(m, d)
     mujoco.mj_forward(m, d)
     problem = dataclasses.replace(from_mujoco(m, d), guess=None)
-    return Draft(problem, f"{model} of {package} under random controls: few rows that share many velocities")
+    return Draft(
+        problem, f"{model} of {package} under random controls: few rows that share many velocities"
+    )
 
 
 def explain_missing_packages(package: str) -> str:
     """Return a message about packages that must be installed for the models of `package`; empty if none is missing."""
-    absent = " and ".join(name for name in ("mujoco", package) if package and find_spec(name) is None)
-    return f"robots of {package} need {absent}: pip install 'lavender-contact[robots]'" if absent else ""
+    absent = " and ".join(
+        name for name in ("mujoco", package) if package and find_spec(name) is None
+    )
+    return (
+        f"robots of {package} need {absent}: pip install 'lavender-contact[robots]'"
+        if absent
+        else ""
+    )

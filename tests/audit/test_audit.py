@@ -27,7 +27,8 @@ def words_of(found):
 def own_errors(path, world, steps, seed=0, spread=0.1):
     """The judge on the forward pass of each step, in the run itself, by the importer of one problem."""
     made = mj.MjModel.from_xml_path(str(path))
-    data, rng = mj.MjData(made), np.random.default_rng(seed + world)
+    data = mj.MjData(made)
+    rng = np.random.default_rng(seed + world)
     if world:
         data.qvel[:] += spread * np.random.default_rng([seed, world]).standard_normal(made.nv)
     out = []
@@ -173,7 +174,8 @@ def test_audit_rows_and_contacts_equal_those_of_mujoco(boxes):
     path = boxes()
     found = audit(path, worlds=2, steps=60, workers=1)
     made = mj.MjModel.from_xml_path(str(path))
-    data, rng = mj.MjData(made), np.random.default_rng(0)
+    data = mj.MjData(made)
+    rng = np.random.default_rng(0)
     for step in range(60):
         data.ctrl[:] = rng.uniform(-1.0, 1.0, made.nu)
         mj.mj_forward(made, data)
@@ -224,20 +226,30 @@ def test_audit_from_keyframes_starts_worlds_in_them(tmp_path, monkeypatch):
 
 NV, NQ = 13, 15
 REFUSED = [
-    *(({"states": arrays}, words) for arrays, words in (
-        ({"qpos": np.zeros((2, NQ))}, "has no qvel"),
-        ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "2 of qpos, 3 of qvel; one number above 0"),
-        ({"qpos": np.zeros((2, NQ - 1)), "qvel": np.zeros((2, NV))}, "qpos"),
-        ({"qpos": np.full((1, NQ), np.nan), "qvel": np.zeros((1, NV))}, "qpos"),
-        ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "0 of qpos, 0 of qvel; one number above 0"),
-        ({"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)}, "has an array 'speed'"),
-        ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"))),
-    ({"states": "torn.npz"}, "torn.npz"), ({"states": "no.npz"}, "no.npz"),
+    *(
+        ({"states": arrays}, words)
+        for arrays, words in (
+            ({"qpos": np.zeros((2, NQ))}, "has no qvel"),
+            ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "2 of qpos, 3 of qvel; one number above 0"),
+            ({"qpos": np.zeros((2, NQ - 1)), "qvel": np.zeros((2, NV))}, "qpos"),
+            ({"qpos": np.full((1, NQ), np.nan), "qvel": np.zeros((1, NV))}, "qpos"),
+            ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "0 of qpos, 0 of qvel; one number above 0"),
+            ({"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)}, "has an array 'speed'"),
+            ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"),
+        )
+    ),
+    ({"states": "torn.npz"}, "torn.npz"),
+    ({"states": "no.npz"}, "no.npz"),
     ({"states": "keyframes"}, "the model has none; a keyframe is needed"),
-    ({"engine": "bullet"}, "engine"), ({"worlds": 0}, "worlds"), ({"control": "zero", "seed": -1}, "seed"),
-    ({"spread": -1.0}, "spread"), ({"precision": "float16"}, "precision"), ({"workers": 0}, "workers"),
-    ({"control": "sometimes"}, "controls sometimes"), ({"backend": "carrier pigeon"}, "backend"),
-]  # fmt: skip
+    ({"engine": "bullet"}, "engine"),
+    ({"worlds": 0}, "worlds"),
+    ({"control": "zero", "seed": -1}, "seed"),
+    ({"spread": -1.0}, "spread"),
+    ({"precision": "float16"}, "precision"),
+    ({"workers": 0}, "workers"),
+    ({"control": "sometimes"}, "controls sometimes"),
+    ({"backend": "carrier pigeon"}, "backend"),
+]
 
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
@@ -335,7 +347,8 @@ def test_next_velocity_of_an_engine_follows_from_its_judged_answer(engine, euler
     frames = list(iterate_frames(engine, replace(runs, spread=0.3)))
     for now, after in itertools.pairwise(frames):
         for i in range(2):
-            problem, motion = now.batch[i], now.batch.engine_motions.get(i)
+            problem = now.batch[i]
+            motion = now.batch.engine_motions.get(i)
             if motion is None:
                 predicted = problem.velocity(now.impulse[i][: problem.m])
             else:

@@ -35,7 +35,8 @@ def make_changed_model(options=EARLY):
 def test_audit_judges_the_changed_model_in_memory_and_as_mjb_alike(boxes, tmp_path):
     model = make_changed_model()
     mj.mj_saveModel(model, str(tmp_path / "changed.mjb"))
-    data, rng = mj.MjData(model), np.random.default_rng(0)
+    data = mj.MjData(model)
+    rng = np.random.default_rng(0)
     expected = []
     for _ in range(30):
         data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
@@ -63,7 +64,9 @@ class Environment:
 
     def __init__(self, length=4, options=EARLY):
         self.model = mj.MjModel.from_xml_string(BOXES.format(options=options))
-        self.data, self.unwrapped, self.length = mj.MjData(self.model), self, length
+        self.data = mj.MjData(self.model)
+        self.unwrapped = self
+        self.length = length
         self.action_space = SimpleNamespace(seed=self.seed_actions, sample=lambda: self.rng.uniform(-1.0, 1.0, 1))
         self.errors = []  # Of every step, by the judge of one problem.
 
@@ -92,7 +95,8 @@ class Environment:
 
 
 def test_audit_of_an_environment_judges_each_step_with_the_model_at_its_time(tmp_path):
-    env, mj_step = Environment(), mj.mj_step
+    env = Environment()
+    mj_step = mj.mj_step
     found = audit(env, worlds=2, steps=30, policy=lambda observation: np.sin(observation[:1]))
     assert mj.mj_step is mj_step and (found.runs.name, found.runs.worlds) == ("Boxes-v0", 2)
     expected = np.array(env.errors).reshape(2, 30)
@@ -126,14 +130,17 @@ def test_read_states_of_a_model_with_other_options_accepts_them(boxes, tmp_path)
 
 
 def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_path):
-    path, other = boxes(EARLY), tmp_path / "other.xml"
+    path = boxes(EARLY)
+    other = tmp_path / "other.xml"
     other.write_text(BOXES.format(options='solver="Newton" iterations="100" tolerance="1e-15"'))
     found = audit(path, worlds=2, steps=30, workers=1, against=other)
     alone = audit(path, worlds=2, steps=30, workers=1)
     assert found.numbers.tobytes() == alone.numbers.tobytes()
     model = mj.MjModel.from_xml_path(str(path))
     converged = mj.MjModel.from_xml_path(str(other))
-    data, copied, rng = mj.MjData(model), mj.MjData(converged), np.random.default_rng(0)
+    data = mj.MjData(model)
+    copied = mj.MjData(converged)
+    rng = np.random.default_rng(0)
     expected = []
     for _ in range(30):
         data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
@@ -187,7 +194,10 @@ def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, 
         """An environment with a hook that pushes the body within the third step of MuJoCo."""
 
         def __init__(self):
-            self.unwrapped, self.model, self.data, self.n = self, model, mj.MjData(model), 0
+            self.unwrapped = self
+            self.model = model
+            self.data = mj.MjData(model)
+            self.n = 0
             self.action_space = type("Space", (), {"seed": lambda self, seed: None, "sample": lambda self: None})()
 
         def reset(self, seed=None):

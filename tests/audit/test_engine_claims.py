@@ -138,7 +138,8 @@ def test_audit_of_steps_judged_in_pieces_equals_the_audit_of_one_piece(tmp_path)
     for sizes in ([48], [12, 36], [7, 1, 20, 20]):
         one = Audit.with_size(Runs("boxes", None, worlds, steps), "theirs")
         for at in np.split(np.arange(48), np.cumsum(sizes)[:-1]):
-            answer, ones = step_of(errors[at], np.ones(len(at))), np.ones(len(at), int)
+            answer = step_of(errors[at], np.ones(len(at)))
+            ones = np.ones(len(at), int)
             frame = Frame(answer.batch, answer.impulse, {}, rows=2 * ones, contacts=ones, n_dropped=len(at))
             judging = Judging("float64", 1e-6, None, contact_share=0.25)
             one.add_piece(judge_steps(frame, judging, world[at], step[at], lambda i: {"q": np.zeros(1)}), None)

@@ -166,15 +166,24 @@ def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
     """A box of 1 kg that rests on a belt of 1 m/s and moves with it, by bodies or by J and M."""
     if form == "bodies":
         rows = lv.Rows(
-            inv_mass=[1.0], inv_inertia=[np.eye(3)], v_free=[[1.0, 0.0, -0.1, 0.0, 0.0, 0.0]],
-            contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)], tangent=[(1.0, 0.0, 0.0)],
-            arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, 0.0)],
-        )  # fmt: skip
+            inv_mass=[1.0],
+            inv_inertia=[np.eye(3)],
+            v_free=[[1.0, 0.0, -0.1, 0.0, 0.0, 0.0]],
+            contact_body=[(-1, 0)],
+            normal=[(0.0, 0.0, 1.0)],
+            tangent=[(1.0, 0.0, 0.0)],
+            arm_a=[(0.0, 0.0, 0.0)],
+            arm_b=[(0.0, 0.0, 0.0)],
+        )
         return lv.Problem.from_rows(rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance])
     return lv.Problem.from_jacobian(
-        np.eye(3)[[2, 0, 1]], np.eye(3), [1.0, 0.0, -0.1], target=[0.0, belt, 0.0], cones=lv.Cones.contacts(mu),
+        np.eye(3)[[2, 0, 1]],
+        np.eye(3),
+        [1.0, 0.0, -0.1],
+        target=[0.0, belt, 0.0],
+        cones=lv.Cones.contacts(mu),
         compliance=[0.0, compliance, compliance],
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("form", ["bodies", "J and M"])
@@ -215,7 +224,9 @@ def test_explain_slip_of_states_subtracts_surface_velocity_of_geoms():
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives(cone):
     """Each <option> is pasted into the model, which then continues from the explained state in MuJoCo alone."""
-    angle, steps, state_kind = 0.3, 100, mujoco.mjtState.mjSTATE_INTEGRATION
+    angle = 0.3
+    steps = 100
+    state_kind = mujoco.mjtState.mjSTATE_INTEGRATION
     model = block(angle, option=f'cone="{cone}"')
     data = mujoco.MjData(model)
     for _ in range(steps - 1):
@@ -250,7 +261,8 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
 
 def falling_states(model, velocities):
     """Return the states of a box that has settled, with these velocities along x and upwards [m/s]."""
-    data, states = mujoco.MjData(model), []
+    data = mujoco.MjData(model)
+    states = []
     for _ in range(300):
         mujoco.mj_step(model, data)
     for x, up in velocities:
@@ -263,7 +275,8 @@ def falling_states(model, velocities):
 def test_slip_over_time_counts_steps_with_contact_of_all_states():
     model = block(0.0, friction=0.1)
     states = falling_states(model, [(0.5, 0.0), (0.2, 1.0)])
-    touches, speeds = np.zeros((2, 1 + REMEDY_STEPS), bool), np.zeros((2, 1 + REMEDY_STEPS))
+    touches = np.zeros((2, 1 + REMEDY_STEPS), bool)
+    speeds = np.zeros((2, 1 + REMEDY_STEPS))
     for own, speed, state in zip(touches, speeds, states, strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

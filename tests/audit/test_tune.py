@@ -62,9 +62,12 @@ def test_option_line_pasted_into_a_model_gives_the_measured_options(options):
 
 def measured(time, error, **options):
     return Measured(
-        Setting(tuple(options.items()), iterations=options.get("iterations", 0)), "Newton", np.full(100, error),
-        np.zeros(10), np.full(3, time),
-    )  # fmt: skip
+        Setting(tuple(options.items()), iterations=options.get("iterations", 0)),
+        "Newton",
+        np.full(100, error),
+        np.zeros(10),
+        np.full(3, time),
+    )
 
 
 def html_of(tuning, folder):
@@ -88,8 +91,10 @@ def first_step(setting, error):
     return setting
 
 
-NOW, QUICK = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
-OTHER, SLOW = measured(1.0, 0.0, cone="elliptic"), measured(20.0, 1e-9, tolerance=1e-15)
+NOW = measured(10.0, 1e-3)
+QUICK = measured(8.0, 1e-3, iterations=9)
+OTHER = measured(1.0, 0.0, cone="elliptic")
+SLOW = measured(20.0, 1e-9, tolerance=1e-15)
 GOOD, ASTRAY = measured(12.0, 1e-5, tolerance=1e-6), measured(5.0, 1e-10, tolerance=1e-4)
 ASTRAY.motion[:] = 1e-3  # Its answers are right, and the bodies are elsewhere.
 RARE = first_step(measured(11.0, 1e-5, tolerance=1e-5), 0.5)
@@ -100,31 +105,42 @@ TUNINGS = {
     "20 of 100 steps have contact": of_contacts(chosen(NOW, QUICK), 20),
     "no step has contact, and no geoms can touch": of_contacts(chosen(NOW, QUICK), 0, False),
     "a faster, a more accurate, and a setting that changes the problem": chosen(
-        NOW, QUICK, measured(2.0, 1e-1, iterations=1), measured(10.2, 1e-5, tolerance=1e-9), SLOW, OTHER),
+        NOW, QUICK, measured(2.0, 1e-1, iterations=1), measured(10.2, 1e-5, tolerance=1e-9), SLOW, OTHER
+    ),
     "of equally fast settings the largest limit of iterations": chosen(
-        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 4e-16, iterations=10),
-        measured(8.0, 1e-17, iterations=99)),
+        measured(10.0, 1e-3, iterations=15),
+        measured(7.0, 3e-16, iterations=3),
+        measured(7.2, 4e-16, iterations=10),
+        measured(8.0, 1e-17, iterations=99),
+    ),
     "an equally fast setting with a larger error is not as accurate": chosen(
-        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 2e-6, iterations=10)),
+        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 2e-6, iterations=10)
+    ),
     "a larger median error is not as accurate, though the largest error is smaller": chosen(
-        first_step(measured(10.0, 1e-4), 1e-1), QUICK),
+        first_step(measured(10.0, 1e-4), 1e-1), QUICK
+    ),
     "a smaller median error is as accurate, though 40 of 100 errors are larger": chosen(
-        first_step(measured(10.0, 1e-4), 1e-1), replace(QUICK, error=np.repeat([1e-5, 1e-3], [60, 40]))),
+        first_step(measured(10.0, 1e-4), 1e-1), replace(QUICK, error=np.repeat([1e-5, 1e-3], [60, 40]))
+    ),
     "the fastest of those within 1e-3 in every step": LIMITED,
     "the choice exceeds 1e-3 on the worlds held back": replace(LIMITED, held_errors={GOOD.setting: 2e-3}),
     "no setting within 1e-12": replace(LIMITED, error_limit=1e-12),
     "no limit": FIVE,
     "two settings within 1e-3 and the noise of times": replace(
-        chosen(measured(10.0, 0.1), GOOD, measured(12.012, 1e-8, iterations=30), SLOW), error_limit=1e-3),
+        chosen(measured(10.0, 0.1), GOOD, measured(12.012, 1e-8, iterations=30), SLOW), error_limit=1e-3
+    ),
     "the present setting is within 0.2": replace(chosen(NOW, SLOW), error_limit=0.2),
     "gains within noise and below the threshold": chosen(
-        measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9), measured(10.0, 1e-12, tolerance=1e-12)),
+        measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9), measured(10.0, 1e-12, tolerance=1e-12)
+    ),
     "an error that is larger than now and below the threshold": chosen(
-        measured(10.0, 1e-9), measured(5.0, 1e-7, tolerance=1e-4)),
+        measured(10.0, 1e-9), measured(5.0, 1e-7, tolerance=1e-4)
+    ),
     "an error of 1 in one step of a hundred": chosen(
-        measured(10.0, 1e-9), first_step(measured(5.0, 1e-10, tolerance=1e-4), 1.0)),
+        measured(10.0, 1e-9), first_step(measured(5.0, 1e-10, tolerance=1e-4), 1.0)
+    ),
     "bodies that end elsewhere": chosen(measured(10.0, 1e-9), ASTRAY),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TUNINGS)
@@ -146,7 +162,8 @@ def test_tuning_has_its_approved_recommendation(name):
 
 def test_tuning_choice_does_not_depend_on_the_worlds_held_back():
     """The second of two equally fast siblings was not judged on the worlds held back."""
-    now, first = measured(10.0, 24.0), measured(9.0, 10.8, solver="CG", iterations=3)
+    now = measured(10.0, 24.0)
+    first = measured(9.0, 10.8, solver="CG", iterations=3)
     second = measured(8.99, 10.80000001, solver="CG", iterations=3, ls_tolerance=1e-3)
     before = chosen(now, first, second)
     for error in (1e-9, 16.0, 1e9):
@@ -174,7 +191,9 @@ def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatc
 def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkeypatch):
     """The times of a step follow from the options here, so that both runs choose from equal times."""
     keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-4, 1e-6, 1e-12, 1, 3, 6, 25}, {"Newton", "CG", "PGS"})
-    run, judge, n_runs = Stage.run_stretches, Stage.judge_setting, []
+    run = Stage.run_stretches
+    judge = Stage.judge_setting
+    n_runs = []
 
     def take_time_of_options(self, model, states=None):
         n_runs.append(states is None)
@@ -183,7 +202,8 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
         return np.full(len(times), 1e-6 * cost), ends
 
     monkeypatch.setattr(Stage, "run_stretches", take_time_of_options)
-    path, found = boxes('solver="CG" iterations="8" tolerance="1e-5"'), []
+    path = boxes('solver="CG" iterations="8" tolerance="1e-5"')
+    found = []
     for limit in (None, 1e-4):
         same = {"worlds": 4, "steps": 40, "repeats": 2, "max_velocity_error": limit}
         part = tune(path, **same)
@@ -208,7 +228,8 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     found = tune(path, worlds=2, steps=10, repeats=1, max_velocity_error=1e3)
     (default,) = (m for m in found.measured if m.setting.is_default)
     model = mj.MjModel.from_xml_path(str(path))
-    applied, plain = default.setting.apply_to(mj, model).opt, mj.MjOption()
+    applied = default.setting.apply_to(mj, model).opt
+    plain = mj.MjOption()
     assert all(getattr(applied, name) == getattr(plain, name) for name in mujoco_settings.OPTIONS)
     assert model.opt.ls_iterations == 8 and applied.ls_iterations == 50
     assert found.choices["choice"].tolist()[0] == "now"

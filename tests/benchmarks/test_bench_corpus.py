@@ -34,8 +34,9 @@ def test_two_checkouts_answer_alike_and_survive_an_error(tmp_path):
     assert corpus.is_solved(rows[0]["base"]) and rows[0]["base"]["work"] == rows[0]["head"]["work"]
     assert "UnknownName" in rows[1]["base"]["status"] and not corpus.is_solved(rows[1]["head"])
     assert [line[:5] for line in corpus.summarize(rows)] == [
-        [group, "auto", "1", "", "1 -> 1"], [group, "no_such", "1", "", "0 -> 0"],
-    ]  # fmt: skip
+        [group, "auto", "1", "", "1 -> 1"],
+        [group, "no_such", "1", "", "0 -> 0"],
+    ]
     assert list(corpus.list_changes(rows)) == []
     rows[0]["head"]["relative"] = 1.0
     assert [line.split(":")[0] for line in corpus.list_changes(rows)] == ["lost"]

@@ -50,7 +50,8 @@ def test_bench_peers_every_adapter_solves_the_same_problem(kind):
 
 
 def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
-    out, steps = tmp_path / "peers.json", []
+    out = tmp_path / "peers.json"
+    steps = []
 
     def short(scene, sweeps):
         steps.extend(measured(scene, sweeps, settle=200, rounds=1))

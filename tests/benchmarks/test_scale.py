@@ -19,13 +19,15 @@ def test_structure_at_rest_converges_with_about_the_rows_requested(name):
     assert solution.success
     # Every structure carries its weight: the ground receives the impulse of gravity in one step, m g h.
     rows = problem.rows
-    mass, gravity = 1.0 / rows.inv_mass, -rows.v_free[:, 2]
+    mass = 1.0 / rows.inv_mass
+    gravity = -rows.v_free[:, 2]
     after = problem.velocity(solution.impulse)[:, 2]
     assert np.sum(mass * np.abs(after)) < 0.5 * np.sum(mass * gravity)
 
 
 def test_structure_with_sliding_and_spread_has_these_speeds_and_masses():
-    rest, moved = build("wall", 500), build("wall", 500, sliding=0.5, spread=1.0)
+    rest = build("wall", 500)
+    moved = build("wall", 500, sliding=0.5, spread=1.0)
     assert np.allclose(np.hypot(*moved.rows.v_free[:, :2].T), 0.5)
     factor = rest.rows.inv_mass / moved.rows.inv_mass
     assert 0.5 < np.std(np.log(factor)) < 1.5  # about 15 bodies

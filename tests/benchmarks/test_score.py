@@ -19,10 +19,24 @@ ROOT = Path(__file__).resolve().parents[2]
 DT = 1 / 240
 #: Largest error of LavenderSim with default settings at 1/240 s: twice the measured one, and at least rounding.
 LAVENDER = {
-    "stick": 1e-9, "slip": 1e-9, "slide": 0.0125, "roll": 1e-9, "stack": 1.3e-3, "ratio": 0.09, "bounce": 0.015,
-    "tumble": 1e-9, "grip": 1e-9, "cards": 1e-5, "belt": 4.2e-3, "pendulum": 1.4, "four-bar": 9e-3, "motor": 1e-9,
-    "heading": 1e-3, "rates": 3.2e-3, "ratios": 1.4,
-}  # fmt: skip
+    "stick": 1e-9,
+    "slip": 1e-9,
+    "slide": 0.0125,
+    "roll": 1e-9,
+    "stack": 1.3e-3,
+    "ratio": 0.09,
+    "bounce": 0.015,
+    "tumble": 1e-9,
+    "grip": 1e-9,
+    "cards": 1e-5,
+    "belt": 4.2e-3,
+    "pendulum": 1.4,
+    "four-bar": 9e-3,
+    "motor": 1e-9,
+    "heading": 1e-3,
+    "rates": 3.2e-3,
+    "ratios": 1.4,
+}
 
 
 def follow(position, velocity, spin=(0, 0, 0)):
@@ -44,7 +58,9 @@ def follow(position, velocity, spin=(0, 0, 0)):
 
 def simulate_ball(scene, dt, every):
     """Fall by symplectic Euler steps; the step that would overlap reverses the velocity by Newton's law instead."""
-    z, v, heights = scene["bodies"][1]["position"][2] - 0.1, 0.0, []
+    z = scene["bodies"][1]["position"][2] - 0.1
+    v = 0.0
+    heights = []
     for _ in range(round(scene["seconds"] / dt) + 1):
         heights.append(z)
         free = v - 9.81 * dt
@@ -66,7 +82,8 @@ def along(distance):
 def test_score_of_an_exact_motion_is_zero():
     angle = math.atan(0.5) + math.radians(1)
     a = 9.81 * (math.sin(angle) - 0.5 * math.cos(angle))
-    stop, roll = 3 / (0.5 * 9.81), 2 / 7 * 2 / (0.3 * 9.81)
+    stop = 3 / (0.5 * 9.81)
+    roll = 2 / 7 * 2 / (0.3 * 9.81)
     rest = follow(still, still)
     exact = {
         "stick": rest,
@@ -111,9 +128,12 @@ def test_score_of_a_slope_finds_the_friction_coefficient_of_each_heading():
 
 def test_score_of_a_gap_is_the_distance_of_the_anchors():
     scene = scenes.describe(
-        "two", 1.0, [scenes.make_body((0.1, 0.1, 0.1), 1.0, (0, 0, 0.5 * i)) for i in range(2)], ground=False,
+        "two",
+        1.0,
+        [scenes.make_body((0.1, 0.1, 0.1), 1.0, (0, 0, 0.5 * i)) for i in range(2)],
+        ground=False,
         joints=[scenes.make_hinge(0, 1, (0, 0, 0.2))],
-    )  # fmt: skip
+    )
     x = np.zeros((1, 2, 13))
     x[0, :, 3], x[0, 1, 2] = 1.0, 0.5
     assert scenes.measure_gaps(scene, x) == pytest.approx(0.0)

@@ -55,12 +55,15 @@ def test_contract_of_a_false_solver_ends_with_1_and_names_unmet_requirements(lav
 
 #: The words with which a command would run, where it has an option of a real number.
 RUNS = {
-    "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1), "tune": ("m.xml", "--worlds", 2, "--steps", 2),
-    "record": ("m.xml", "--steps", 1, "--out", "out"), "check": ("stack(n=2)", "--solvers", "pgs"),
+    "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1),
+    "tune": ("m.xml", "--worlds", 2, "--steps", 2),
+    "record": ("m.xml", "--steps", 1, "--out", "out"),
+    "check": ("stack(n=2)", "--solvers", "pgs"),
     "explain": ("stack(n=2)",),
-    "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK), "run": ("stack", "--solver", "newton"),
+    "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK),
+    "run": ("stack", "--solver", "newton"),
     "solve": ("stack(n=2)",),
-}  # fmt: skip
+}
 
 
 def options_of_real_numbers():

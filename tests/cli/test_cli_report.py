@@ -28,9 +28,21 @@ def test_explain_command_prints_stages_and_json(lavender):
 
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
-        "report", "--tolerances=1e-2", "--solvers", "pgs", "jacobi", "--budgets", "3", "5", path, "--repeats", 1,
-         "--no-figures", "--out", tmp_path / "out",
-    )  # fmt: skip
+        "report",
+        "--tolerances=1e-2",
+        "--solvers",
+        "pgs",
+        "jacobi",
+        "--budgets",
+        "3",
+        "5",
+        path,
+        "--repeats",
+        1,
+        "--no-figures",
+        "--out",
+        tmp_path / "out",
+    )
     assert code == 0
     runs = report.select_runs(report.read(tmp_path / "out"))
     assert set(runs["solver"]) == {"pgs", "jacobi"}

@@ -27,7 +27,8 @@ def test_slip_command_on_a_geom_without_contact_ends_with_1(lavender, tmp_path):
 
 @pytest.mark.parametrize("command", [("slip", "--steps", 15), ("audit", "--worlds", 1, "--steps", 5)])
 def test_command_makes_the_folders_of_its_page_and_rejects_a_file_in_their_place(command, lavender, tmp_path):
-    model, page = tmp_path / "slope.xml", tmp_path / "new" / "of" / "page"
+    model = tmp_path / "slope.xml"
+    page = tmp_path / "new" / "of" / "page"
     model.write_text(SLOPE)
     code, _, error = lavender(command[0], model, *command[1:], "--out", page)
     assert code in (0, 1), error

@@ -33,7 +33,8 @@ def test_audit_command_exit_code_follows_the_error_limit(lavender, boxes, tmp_pa
 
 
 def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, boxes, tmp_path):
-    path, file = boxes(EARLY), tmp_path / "contact.npz"
+    path = boxes(EARLY)
+    file = tmp_path / "contact.npz"
     words = ("--worlds", 2, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")
     code, out, _ = lavender("audit", path, *words, "--save-states", "contact", file, "--keep", 5)
     assert code == 0 and f"{file}: " in out and "states for --states" in out

@@ -6,11 +6,16 @@ from click.shell_completion import ShellComplete
 from lavender.cli.entry import cli
 
 HAS_ALL_NAMES = {
-    "solve x.npz --solver": ("pg", {"pgs"}), "report --solvers": ("auto,sequential_imp", {"auto,sequential_impulses"}),
-    "check --solvers": ("nn", {"nncg"}), "run": ("four_b", {"four_bar"}), "run stack --solver": ("ad", {"admm"}),
-    "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}), "check x.npz --reference": ("osq", {"osqp"}),
-    "contract": ("jac", {"jacobi"}), "solvers": ("hig", {"highs"}),
-}  # fmt: skip
+    "solve x.npz --solver": ("pg", {"pgs"}),
+    "report --solvers": ("auto,sequential_imp", {"auto,sequential_impulses"}),
+    "check --solvers": ("nn", {"nncg"}),
+    "run": ("four_b", {"four_bar"}),
+    "run stack --solver": ("ad", {"admm"}),
+    "audit model.xml --engine": ("mujo", {"mujoco", "mujoco_warp"}),
+    "check x.npz --reference": ("osq", {"osqp"}),
+    "contract": ("jac", {"jacobi"}),
+    "solvers": ("hig", {"highs"}),
+}
 
 
 def complete(words, incomplete):

@@ -24,9 +24,22 @@ BOX = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
 
 #: Packages that take 20 ms or more to load.
 SLOW = {
-    "scipy", "pandas", "matplotlib", "jinja2", "rich", "joblib", "mujoco", "h5py", "qpsolvers", "osqp", "clarabel",
-    "distributed", "dask", "torch", "jax",
-}  # fmt: skip
+    "scipy",
+    "pandas",
+    "matplotlib",
+    "jinja2",
+    "rich",
+    "joblib",
+    "mujoco",
+    "h5py",
+    "qpsolvers",
+    "osqp",
+    "clarabel",
+    "distributed",
+    "dask",
+    "torch",
+    "jax",
+}
 #: {command: packages of SLOW that it loads}. A page is drawn by pandas, jinja2 and matplotlib.
 NEEDED = {
     "explain problem.npz": set(),

@@ -53,9 +53,12 @@ def install(tmp_path):
 
 def test_solvers_with_broken_plug_ins_reports_each_once_and_lists_the_rest(install):
     environment = install(
-        "good = plugin_module:GOOD", "alias = plugin_module:OTHER", "taken = plugin_module:TAKEN",
-        "leave = plugin_module:leave", "misspelt = plugin_module:misspelt",
-    )  # fmt: skip
+        "good = plugin_module:GOOD",
+        "alias = plugin_module:OTHER",
+        "taken = plugin_module:TAKEN",
+        "leave = plugin_module:leave",
+        "misspelt = plugin_module:misspelt",
+    )
     done = python("-m", "lavender", "solvers", env=environment)
     warnings = done.stderr.splitlines()
     expected = (

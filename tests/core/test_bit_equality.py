@@ -81,13 +81,14 @@ def solve_after_a_residual(problem, name, **options):
 #: Ways to solve a problem of which nothing was derived before.
 WAYS = {
     "a pickled problem": lambda p, name, **more: lv.solve(pickle.loads(pickle.dumps(p)), name, **more),
-    "judged before": solve_after_a_residual, "one of a list": lambda p, name,
-    **more: lv.solve_many([p], name, **more)[0], "a list and two threads": lambda p, name,
-    **more: lv.solve_many([p] * 3, name, threads=2, **more)[2], "eight threads": solve_in_eight_threads,
+    "judged before": solve_after_a_residual,
+    "one of a list": lambda p, name, **more: lv.solve_many([p], name, **more)[0],
+    "a list and two threads": lambda p, name, **more: lv.solve_many([p] * 3, name, threads=2, **more)[2],
+    "eight threads": solve_in_eight_threads,
     "a time limit that does not bind": lambda p, name, **more: lv.solve(p, name, time_limit=600.0, **more),
     "a list and a time limit": lambda p, name, **more: lv.solve_many([p], name, time_limit=600.0, **more)[0],
     "a callback": solve_with_a_callback,
-}  # fmt: skip
+}
 
 
 @functools.cache
@@ -116,12 +117,16 @@ def test_prepared_solve_from_a_start_has_the_bits_of_a_fresh_solve(name):
 
 def run_solver(problem, sizes, name, tol=1e-9, budget=1000, **options):
     """`run` of a solver, `advance` of newton, until another claim than MAX_ITERATIONS or the end of the budget."""
-    solver, impulse, done, status = registry.get(name).load()(**options), problem.start(), 0, None
+    solver = registry.get(name).load()(**options)
+    impulse = problem.start()
+    done = 0
+    status = None
     state = solver.prepare(problem)
     call = solver.advance if name == "newton" else solver.run
     for size in itertools.chain(sizes, itertools.repeat(sizes[-1])):
         claim = call(state, impulse, min(size, budget - done), tol, None)
-        done, status = done + claim.iterations, claim.status
+        done = done + claim.iterations
+        status = claim.status
         if status is not lv.Status.MAX_ITERATIONS or done >= budget:
             return done, status, impulse.tobytes()
 
@@ -142,7 +147,8 @@ def run_driver(problem, sizes):
 
 
 def run_over_velocities(problem, sizes):
-    kernel, impulse = general.prepare_islands(problem), problem.start().copy()
+    kernel = general.prepare_islands(problem)
+    impulse = problem.start().copy()
     kernel.start(impulse, 1e-9, 300)
     while kernel.step(sizes[0], impulse) == OUTCOMES["more"]:
         pass
@@ -181,10 +187,14 @@ def random_bounded():
 def alternating_islands():
     """J and M of two islands whose rows alternate, under each kind of bound."""
     rng = np.random.default_rng(0)
-    kinds = (lv.Cones.bounded(np.zeros(20), 1.0), lv.Cones.contacts(0.7, count=4),
-             lv.Cones.contacts([0.7, 0.0, 0.3], tangents=2, patch_radius=0.1))  # fmt: skip
+    kinds = (
+        lv.Cones.bounded(np.zeros(20), 1.0),
+        lv.Cones.contacts(0.7, count=4),
+        lv.Cones.contacts([0.7, 0.0, 0.3], tangents=2, patch_radius=0.1),
+    )
     for cones, compliance in itertools.product(kinds, (0.0, 0.1)):
-        jac, half = rng.normal(size=(cones.n_rows, 14)), rng.normal(size=(2, 7, 7))
+        jac = rng.normal(size=(cones.n_rows, 14))
+        half = rng.normal(size=(2, 7, 7))
         first = np.repeat(np.arange(cones.n_blocks) % 2 == 0, np.diff(cones.ptr))
         jac[first, 7:] = jac[~first, :7] = 0.0
         mass = np.kron(np.eye(2), np.ones((7, 7))) * np.tile(np.hstack(half @ half.swapaxes(1, 2)), (2, 1))
@@ -198,7 +208,10 @@ ORDERS = ({}, {"order": "random"}, {"order": "symmetric"}, {"order": "colored"})
 RUNS = {
     **{
         f"{name} {order.get('order', '')} to {tol:g}": (
-            functools.partial(run_solver, name=name, tol=tol, budget=23, **order), examples, [23], [1, 7, 15],
+            functools.partial(run_solver, name=name, tol=tol, budget=23, **order),
+            examples,
+            [23],
+            [1, 7, 15],
         )
         for name in RESUMABLE
         for order in (ORDERS if registry.get(name).order else ORDERS[:1])
@@ -214,11 +227,14 @@ RUNS = {
     "newton over velocities": (run_over_velocities, alternating_islands, [300], [1]),
     **{
         f"a step of auto: {kind}": (
-            functools.partial(run_step_of_auto, kind=kind), lambda: [stacks(4, 4, 0.5, False)], [40], [3, 10, 27],
+            functools.partial(run_step_of_auto, kind=kind),
+            lambda: [stacks(4, 4, 0.5, False)],
+            [40],
+            [3, 10, 27],
         )
         for kind in ("anderson", "admm", "newton")
     },
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", RUNS)

@@ -58,7 +58,8 @@ def solve_cases(draw):
     name = draw(st.sampled_from(external if external and draw(st.integers(0, 9)) == 9 else own))
     if len(data["cones"]["kind"]) > 10 and draw(st.booleans()):
         name = "auto"  # it solves each island by itself
-    spec, rng = lv.get(name), np.random.default_rng(draw(seeds))
+    spec = lv.get(name)
+    rng = np.random.default_rng(draw(seeds))
     options = {"tol": draw(st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0)))}
     options["max_iter"] = draw(st.sampled_from((1, 2, 20, 50, 200, spec.max_iter)))
     start = draw(st.sampled_from(STARTS))
@@ -87,14 +88,19 @@ def bits(solution):
     r = solution.residual
     numbers = np.array([r.relative, r.energy, r.velocity, r.roundoff_floor])
     return (
-        solution.impulse.tobytes(), solution.slack.tobytes(), numbers.tobytes(), solution.status.name,
-        solution.iterations, tuple(sorted(solution.work.items())),
-    )  # fmt: skip
+        solution.impulse.tobytes(),
+        solution.slack.tobytes(),
+        numbers.tobytes(),
+        solution.status.name,
+        solution.iterations,
+        tuple(sorted(solution.work.items())),
+    )
 
 
 def hash_of(problem):
     """Return a hash of everything that a solver could have changed."""
-    digest, c = hashlib.sha256(), problem.cones
+    digest = hashlib.sha256()
+    c = problem.cones
     arrays = [problem.b, problem.d, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, c.rolling]
     matrices = [problem.csr] if problem.generalized is None else [problem.jacobian, problem.generalized.mass]
     for matrix in matrices:
@@ -106,14 +112,17 @@ def hash_of(problem):
 
 def check_case(case):
     """Solve a case, compare its claims with the judge in long double, and repeat it in every other way it names."""
-    problem, name, options = build_problem(case["problem"]), case["solver"], case["options"]
+    problem = build_problem(case["problem"])
+    name = case["solver"]
+    options = case["options"]
     before = hash_of(problem) if case.get("again") else None
     try:
         if case.get("prepared"):
             mine = {k: v for k, v in options.items() if k == "order"}
             rest = {k: v for k, v in options.items() if k != "order"}
             prepared = lv.prepare(problem, name, **mine)
-            first, solution = prepared.solve(**rest), prepared.solve(problem, **rest)
+            first = prepared.solve(**rest)
+            solution = prepared.solve(problem, **rest)
             assert bits(first) == bits(solution)
         else:
             solution = lv.solve(problem, name, **options)
@@ -130,7 +139,8 @@ def check_case(case):
 
 def check_many(case, problem, solution):
     """Solve the same structure with other b in one call, and one by one."""
-    options, others = dict(case["options"]), []
+    options = dict(case["options"])
+    others = []
     start = options.pop("impulse", None)
     for b in case["others"]:
         try:
@@ -148,7 +158,9 @@ def check_many(case, problem, solution):
 
 def check_claims(data, problem, solution, options):
     """Compare status, success and numbers of a solution with the judge in long double."""
-    spec, status, r = lv.get(solution.solver.name), solution.status.name, solution.residual
+    spec = lv.get(solution.solver.name)
+    status = solution.status.name
+    r = solution.residual
     budget = options.get("max_iter", spec.max_iter)
     if not spec.external:  # Those count in their own way.
         assert solution.iterations <= budget
@@ -239,7 +251,8 @@ def test_problems_that_once_had_false_claims_stay_fixed(case):
 def check_hostile_solves(first, last):
     """Solve the drawn problems `first` to `last` with a drawn solver and start, and compare the claims."""
     for seed in range(first, last):
-        problem, rng = draw_problem(seed), np.random.default_rng(seed)
+        problem = draw_problem(seed)
+        rng = np.random.default_rng(seed)
         name = str(rng.choice([n for n in lv.available(problem) if lv.get(n).builtin and not lv.get(n).external]))
         options = {"tol": float(rng.choice([1e-3, 1e-6, 1e-9, 1e-12]))}
         if rng.random() < 0.3:
@@ -270,7 +283,8 @@ def test_claims_about_hostile_problems_hold_in_long_double_and_every_solve_ends(
 def test_the_comparison_in_long_double_detects_false_claims():
     problem = random_lcp(3)
     solution = lv.solve(problem, "direct", tol=1e-9)
-    data, options = plain_data(problem), {"tol": 1e-9}
+    data = plain_data(problem)
+    options = {"tol": 1e-9}
     check_claims(data, problem, solution, options)
 
     for changed in (

@@ -115,9 +115,15 @@ def make_tree_batch(law, seed=1):
     pattern = np.array([j for _, j in lower]), np.cumsum([0] + [len(x) for x in below])
     compliance = [rng.uniform(1e-3, 0.1, m) for m in rows]
     return lv.Batch(
-        np.concatenate(jac), (values, *pattern), rng.normal(size=n * nv), target=rng.normal(size=sum(rows)),
-        cones=cones, compliance=np.concatenate(compliance), friction=law, row_ptr=np.cumsum([0, *rows]),
-    )  # fmt: skip
+        np.concatenate(jac),
+        (values, *pattern),
+        rng.normal(size=n * nv),
+        target=rng.normal(size=sum(rows)),
+        cones=cones,
+        compliance=np.concatenate(compliance),
+        friction=law,
+        row_ptr=np.cumsum([0, *rows]),
+    )
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9])
@@ -127,7 +133,8 @@ def test_mixed_worlds_over_trees_have_the_bits_of_single_calls(width, law, tol):
     many = lv.solve_many(batch, tol=tol)
     judged = lv.residual_many(batch, many.impulse + 1e-4)
     for i in range(len(batch)):
-        rows, one = batch.rows_of(i), lv.solve(batch[i], tol=tol)
+        rows = batch.rows_of(i)
+        one = lv.solve(batch[i], tol=tol)
         assert many.impulse[rows].tobytes() == one.impulse.tobytes()
         assert (many.status[i], many.iterations[i]) == (one.status, one.iterations)
         assert (many.relative[i], many.roundoff_floor[i]) == (one.residual.relative, one.residual.roundoff_floor)

@@ -33,7 +33,8 @@ WORLDS = ("batch", "problems", "matrices", "bounded", "float32 view", "zeros of 
 def draw_worlds(kind):
     """Draw worlds: slow ones, in which the zero impulse meets 1e-3 m/s, and a heavy one with a large energy."""
     rng = np.random.default_rng(0)
-    jac, mass = rng.normal(size=(6, 6, 9)), np.array([np.diag(rng.uniform(0.5, 2.0, 9)) for _ in range(6)])
+    jac = rng.normal(size=(6, 6, 9))
+    mass = np.array([np.diag(rng.uniform(0.5, 2.0, 9)) for _ in range(6)])
     free = -(jac[:, 0] + jac[:, 3] + 0.3 * jac[:, 1]) * np.array([1.0, 1e-6, 5e-7, 1e-7, 1.0, 1.0])[:, None]
     mass[2] *= 1e6
     cones = lv.Cones.contacts(0.5, count=2)
@@ -45,7 +46,9 @@ def draw_worlds(kind):
         for world, column in zip(mass, (0, 1, 2, 1, 0, 3), strict=True):
             world[4, column] = world[column, 4] = 0.3 * world[0, 0]
     if kind == "float32 view":
-        wide, mass, free = np.zeros((6, 6, 14), np.float32), mass.astype(np.float32), free.astype(np.float32)
+        wide = np.zeros((6, 6, 14), np.float32)
+        mass = mass.astype(np.float32)
+        free = free.astype(np.float32)
         wide[:, :, 2:11] = jac
         jac = wide[:, :, 2:11]
     batch = lv.Batch(jac, mass, free, cones=cones)
@@ -54,13 +57,20 @@ def draw_worlds(kind):
 
 #: Name of each array of `Solutions` and `Residuals` to the same number of a single result.
 SINGLE = {
-    "status": lambda s, r: s.status, "success": lambda s, r: s.success, "iterations": lambda s, r: s.iterations,
-    "verdict": lambda s, r: r.verdict, "excess": lambda s, r: r.excess, "relative": lambda s, r: r.relative,
-    "energy": lambda s, r: r.energy, "velocity_error": lambda s, r: r.velocity, "roundoff_floor": lambda s,
-    r: r.roundoff_floor, "worst_row": lambda s, r: r.worst_row, "energy_at_zero": lambda s, r: r.energy_at_zero,
-    "velocity_at_zero": lambda s, r: r.velocity_at_zero, "impulse_error": lambda s,
-    r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
-}  # fmt: skip
+    "status": lambda s, r: s.status,
+    "success": lambda s, r: s.success,
+    "iterations": lambda s, r: s.iterations,
+    "verdict": lambda s, r: r.verdict,
+    "excess": lambda s, r: r.excess,
+    "relative": lambda s, r: r.relative,
+    "energy": lambda s, r: r.energy,
+    "velocity_error": lambda s, r: r.velocity,
+    "roundoff_floor": lambda s, r: r.roundoff_floor,
+    "worst_row": lambda s, r: r.worst_row,
+    "energy_at_zero": lambda s, r: r.energy_at_zero,
+    "velocity_at_zero": lambda s, r: r.velocity_at_zero,
+    "impulse_error": lambda s, r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
+}
 
 
 def list_arrays(results):
@@ -157,10 +167,13 @@ def test_relative_residual_of_an_impulse_that_hides_b_is_at_least_its_floor(isla
 def test_row_that_no_impulse_moves_is_compared_with_its_target_and_the_velocity_of_its_body(target):
     """b = target - J v* is the rounding of both, for a driven body of infinite mass."""
     rows = lv.Rows(
-        inv_mass=[0.0, 1.0], inv_inertia=[np.zeros((3, 3)), np.eye(3)],
+        inv_mass=[0.0, 1.0],
+        inv_inertia=[np.zeros((3, 3)), np.eye(3)],
         v_free=[[0.0, 0.0, 0.1 * 3 if target == 0.3 else 1.0, 0.0, 0.0, 0.0], np.zeros(6)],
-        jac=np.tile(np.eye(12)[8], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[(-1, 0), (-1, 1)],
-    )  # fmt: skip
+        jac=np.tile(np.eye(12)[8], (2, 1)),
+        joint_ptr=[0, 1, 2],
+        joint_body=[(-1, 0), (-1, 1)],
+    )
     problem = lv.Problem.from_rows(rows, target=[target, 0.0])
     found = lv.residual(problem, problem.start())
     assert problem.b[0] != 0.0 and found.relative == pytest.approx(abs(problem.b[0]) / (2.0 * target), rel=1e-12)
@@ -173,15 +186,20 @@ def test_floor_energy_of_free_rows_is_that_of_numpy(form):
     rows = random_bodies_and_contacts(rng, bodies=5, joints=4, contacts=0)
     compliance = rng.uniform(0.0, 0.1, rows.joint_ptr[-1])
     problem = lv.Problem.from_rows(rows, compliance=compliance)
-    impulse, b, d = rng.normal(size=problem.m), problem.b, problem.d
+    impulse = rng.normal(size=problem.m)
+    b = problem.b
+    d = problem.d
     mass = [np.diag(np.full(3, x)) for x in rows.inv_mass]
     inverse = sp.block_diag([x for pair in zip(mass, np.abs(rows.inv_inertia), strict=True) for x in pair]).toarray()
     jac = np.abs(problem.jacobian.toarray())
     terms = jac @ (inverse @ (jac.T @ np.abs(impulse))) + compliance * np.abs(impulse)
     if form == "J and M":  # with a diagonal M, which has a diagonal root
-        jac, mass = rng.normal(size=(problem.m, 12)), rng.uniform(0.5, 2.0, 12)
+        jac = rng.normal(size=(problem.m, 12))
+        mass = rng.uniform(0.5, 2.0, 12)
         problem = lv.Problem.from_jacobian(jac, np.diag(mass), np.ones(12), cones=problem.cones, compliance=compliance)
-        b, d, jac = problem.b, problem.d, np.abs(jac)
+        b = problem.b
+        d = problem.d
+        jac = np.abs(jac)
         terms = jac @ (jac.T @ np.abs(impulse) / mass) + compliance * np.abs(impulse)
     elif form == "matrix":
         problem = lv.Problem(b, problem.cones, problem.csr)
@@ -278,19 +296,23 @@ def test_equivalent_rows_take_the_same_work_and_have_equivalent_answers(name, ch
     """lambda = sign size lambda' + shift; A is not symmetric, so that lemke follows paths, then exchanges."""
     paths = 0
     for seed in range(8):
-        rng, m = np.random.default_rng(seed), 8
+        rng = np.random.default_rng(seed)
+        m = 8
         half, skew = rng.normal(size=(m, m)), rng.normal(size=(m, m))
-        a, b = half @ half.T / m + 0.3 * np.eye(m) + 0.7 * (skew - skew.T), 3.0 * rng.normal(size=m)
+        a = half @ half.T / m + 0.3 * np.eye(m) + 0.7 * (skew - skew.T)
+        b = 3.0 * rng.normal(size=m)
         low = np.where(rng.random(m) < 0.8, rng.uniform(-1.0, 0.5, m), -np.inf)
         high = np.where((rng.random(m) < 0.5) & np.isfinite(low), low + 1.0, np.inf)
         sign, size, shift = np.ones(m), np.ones(m), np.zeros(m)
         if change == "signs":
-            sign, high = rng.choice([-1.0, 1.0], m), np.full(m, np.inf)  # lower limits become upper ones
+            sign = rng.choice([-1.0, 1.0], m)
+            high = np.full(m, np.inf)  # lower limits become upper ones
         elif change == "units":
             size = 2.0 ** rng.integers(-6, 7, m)
         else:
             shift = np.where(np.isfinite(low), low, 0.0)
-        factor, new_b = sign * size, sign * size * (b - a @ shift)
+        factor = sign * size
+        new_b = sign * size * (b - a @ shift)
         ends = (low - shift) / factor, (high - shift) / factor
         more = {"tol": 1e-8, "max_iter": 2000}
         one = lv.solve(lv.Problem.lcp(a, b, low, high), name, **more)
@@ -309,7 +331,10 @@ class Steps:
     """A backend and its judge that return and accept given points, one after the other."""
 
     def __init__(self, statuses, accepted):
-        self.statuses, self.accepted, self.calls, self.received = statuses, iter(accepted), 0, []
+        self.statuses = statuses
+        self.accepted = iter(accepted)
+        self.calls = 0
+        self.received = []
 
     def accepts(self, x, lam, is_last):
         return next(self.accepted)
@@ -317,19 +342,23 @@ class Steps:
     def __call__(self, scaled, start, limits, settings):
         self.calls += 1
         self.received.append((int(np.sum(scaled.is_kept)) if scaled.is_kept is not None else "all", start, limits))
-        x, work = np.full(scaled.n, float(self.calls)), {"iterations": 30}
+        x = np.full(scaled.n, float(self.calls))
+        work = {"iterations": 30}
         return Answer(lv.Status[self.statuses[self.calls - 1]], f"call {self.calls}", x, np.zeros(len(scaled.t)), work)
 
 
 @pytest.mark.parametrize(
     ("statuses", "accepted", "best"),
     [
-        (["STALLED", "CONVERGED"], [False, True], 2), (["STALLED", "NUMERICAL_ERROR"], [False, False], 1),
-        (["CONVERGED"], [True], 1), (["NUMERICAL_ERROR", "STALLED"], [False, False], 2),
+        (["STALLED", "CONVERGED"], [False, True], 2),
+        (["STALLED", "NUMERICAL_ERROR"], [False, False], 1),
+        (["CONVERGED"], [True], 1),
+        (["NUMERICAL_ERROR", "STALLED"], [False, False], 2),
     ],
-)  # fmt: skip
+)
 def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses, accepted, best):
-    program, steps = get_program(lv.Problem.from_qp(np.eye(2), np.ones(2), G=[[1.0, 1.0]], h=[1.0]).qp), None
+    program = get_program(lv.Problem.from_qp(np.eye(2), np.ones(2), G=[[1.0, 1.0]], h=[1.0]).qp)
+    steps = None
     steps = Steps(statuses, accepted)
     more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
     found = call_backend_until_accepted(program, steps, steps, **more)
@@ -340,7 +369,8 @@ def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses
 
 def test_second_call_of_a_backend_has_all_rows_a_smaller_tolerance_and_the_rest_of_the_budget():
     program = get_program(lv.Problem.from_qp(np.diag([4.0, 1e4]), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp)
-    steps, start = Steps(["STALLED", "CONVERGED"], [False, True]), (np.array([3.0, 5.0]), np.array([7.0, 11.0]))
+    steps = Steps(["STALLED", "CONVERGED"], [False, True])
+    start = (np.array([3.0, 5.0]), np.array([7.0, 11.0]))
     more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
     call_backend_until_accepted(program, steps, steps, start=start, **more)
     (rows, x, first), (all_rows, _, second) = steps.received
@@ -374,13 +404,21 @@ def test_program_form_of_more_rows_than_velocities_is_the_velocity_form():
 @pytest.mark.parametrize(
     ("text", "status"),
     [
-        ("solved inaccurate", "STALLED"), ("primal infeasible inaccurate", "STALLED"), ("AlmostSolved", "STALLED"),
-        ("AlmostPrimalInfeasible", "STALLED"), ("AlmostDualInfeasible", "STALLED"), ("PrimalInfeasible", "INFEASIBLE"),
-        ("dual infeasible", "INFEASIBLE"), ("maximum iterations reached", "MAX_ITERATIONS"), ("Solved", "CONVERGED"),
-        ("run time limit reached", "TIME_LIMIT"), ("interrupted", "INTERRUPTED"), ("InsufficientProgress", "STALLED"),
+        ("solved inaccurate", "STALLED"),
+        ("primal infeasible inaccurate", "STALLED"),
+        ("AlmostSolved", "STALLED"),
+        ("AlmostPrimalInfeasible", "STALLED"),
+        ("AlmostDualInfeasible", "STALLED"),
+        ("PrimalInfeasible", "INFEASIBLE"),
+        ("dual infeasible", "INFEASIBLE"),
+        ("maximum iterations reached", "MAX_ITERATIONS"),
+        ("Solved", "CONVERGED"),
+        ("run time limit reached", "TIME_LIMIT"),
+        ("interrupted", "INTERRUPTED"),
+        ("InsufficientProgress", "STALLED"),
         ("problem non convex", "NUMERICAL_ERROR"),
     ],
-)  # fmt: skip
+)
 def test_classify_status_of_a_backend_wording_is_never_more_certain(text, status):
     assert classify_status(text) is lv.Status[status]
 
@@ -393,7 +431,8 @@ def test_program_rows_below_the_infinite_size_are_kept_and_their_multipliers_ret
     scaled = get_program(qp).scaled
     lam = np.arange(1.0, len(qp.target) + 1.0)
     np.testing.assert_array_equal(scaled.join_multipliers(*scaled.split_multipliers(lam)), lam)
-    x, y = np.array([0.3, 0.5, -0.2]), lam
+    x = np.array([0.3, 0.5, -0.2])
+    y = lam
     convex = get_program(qp)
     for found, expected in zip(convex.restore_point(*convex.scale_point(x, y)), (x, y), strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -404,10 +443,14 @@ def test_program_rows_below_the_infinite_size_are_kept_and_their_multipliers_ret
 )
 def test_solve_qp_of_unequally_scaled_variables_meets_tol_in_its_own_terms(name):
     for seed in range(6):
-        rng, n = np.random.default_rng(seed), 6
-        scale, half = 10.0 ** rng.uniform(-3.0, 3.0, n), rng.normal(size=(n, n))
+        rng = np.random.default_rng(seed)
+        n = 6
+        scale = 10.0 ** rng.uniform(-3.0, 3.0, n)
+        half = rng.normal(size=(n, n))
         P = (half @ half.T / n + 0.1 * np.eye(n)) * np.outer(scale, scale)
-        q, G, h = rng.normal(size=n) * scale, rng.normal(size=(4, n)) * scale, rng.uniform(-1.0, 1.0, 4)
+        q = rng.normal(size=n) * scale
+        G = rng.normal(size=(4, n)) * scale
+        h = rng.uniform(-1.0, 1.0, 4)
         for tol in (1e-4, 1e-7):
             answer = lv.solve_qp(P, q, G, h, solver=name, tol=tol)
             assert answer.found and answer.error <= tol, f"{name}, {seed}, {tol}: {answer}"
@@ -533,7 +576,8 @@ def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
 
 def test_solution_history_and_time_exclude_the_judge(monkeypatch):
     """The judge takes 1 s of a clock that nothing else moves."""
-    now, judge = [0.0], log.measure_residual
+    now = [0.0]
+    judge = log.measure_residual
 
     def judge_slowly(*given):
         now[0] += 1.0
@@ -561,7 +605,8 @@ def test_solution_history_and_time_exclude_the_judge(monkeypatch):
 
 def test_gradient_by_mass_is_symmetric_and_of_a_doubled_contact_that_of_the_single_one():
     given = draw_worlds("batch")[0]
-    jac, mass = given.generalized.jac, spd(9)[0]
+    jac = given.generalized.jac
+    mass = spd(9)[0]
     problem = lv.Problem.from_jacobian(jac, mass, given.generalized.v_free, cones=given.cones)
     solution = lv.solve(problem, tol=1e-13)
     gradient = lv.derivative(problem, solution).vjp(velocity=np.arange(1.0, 10.0))
@@ -597,8 +642,10 @@ def build_chain(order):
 
 
 def test_generalized_reordered_mass_is_shifted_in_the_given_order():
-    n, line = 400, sp.diags_array([np.full(19, -1.0), np.full(20, 4.5), np.full(19, -1.0)], offsets=[-1, 0, 1])
-    order, eye = np.random.default_rng(1).permutation(n), sp.eye_array(20)
+    n = 400
+    line = sp.diags_array([np.full(19, -1.0), np.full(20, 4.5), np.full(19, -1.0)], offsets=[-1, 0, 1])
+    order = np.random.default_rng(1).permutation(n)
+    eye = sp.eye_array(20)
     mass = sp.csr_array(sp.kron(line, eye) + sp.kron(eye, line))[order][:, order]
     general = lv.Generalized(np.eye(3, n), mass, np.zeros(n))
     assert general.order is not None
@@ -622,10 +669,12 @@ def list_problems_with_islands():
     """Return problems with several islands in every form; a tree of M also has velocities without rows."""
     chain = build_chain(np.arange(40)).generalized
     general = lv.Problem.from_jacobian(
-        sp.block_diag([chain.jac, chain.jac]), sp.block_diag([chain.mass, chain.mass]),
-        np.r_[chain.v_free, -chain.v_free], cones=lv.Cones.contacts([0.5] * 6, 2),
+        sp.block_diag([chain.jac, chain.jac]),
+        sp.block_diag([chain.mass, chain.mass]),
+        np.r_[chain.v_free, -chain.v_free],
+        cones=lv.Cones.contacts([0.5] * 6, 2),
         compliance=np.linspace(0.0, 1e-2, 18),
-    )  # fmt: skip
+    )
     rng = np.random.default_rng(8)
     rows = random_bodies_and_contacts(rng, bodies=12, joints=2, contacts=5)
     bodies = lv.Problem.from_rows(rows, mu=0.5, compliance=rng.uniform(0.0, 0.1, rows.joint_ptr[-1] + 15))
@@ -656,7 +705,8 @@ def test_references_of_a_problem_are_those_of_its_islands_together(kind):
 def test_solution_message_of_an_unfinished_solve_names_its_worst_island(kind):
     problem = list_problems_with_islands()[kind]
     solution = lv.solve(problem, "pgs", tol=1e-14, max_iter=2)
-    label, worst = solution.residual.islands[0], solution.residual.worst_island
+    label = solution.residual.islands[0]
+    worst = solution.residual.worst_island
     name = problem.block_name(int(np.flatnonzero(label == worst)[0]))
     assert not solution.success and f"island {worst} ({name}" in solution.message
 
@@ -704,7 +754,8 @@ def test_auto_proves_an_infeasible_island_of_any_signs_at_any_place(place, signs
         jac = [[one, 0.2 * one], [other, 0.2 * other]]
         cones = lv.Cones.bounded(low, high)
         rows.append(lv.Problem.from_jacobian(jac, np.eye(2), [0.0, 0.0], target=target, cones=cones))
-    jac, b = sp.block_diag([p.generalized.jac for p in rows]), np.concatenate([p.b for p in rows])
+    jac = sp.block_diag([p.generalized.jac for p in rows])
+    b = np.concatenate([p.b for p in rows])
     cones = lv.Cones.bounded(*(np.concatenate([getattr(p.cones, n) for p in rows]) for n in ("lower", "upper")))
     whole = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), target=b, cones=cones)
     for problem in (whole, lv.Problem(whole.b, whole.cones, whole.csr)):
@@ -718,11 +769,15 @@ def test_auto_proves_an_infeasible_island_of_any_signs_at_any_place(place, signs
 def test_sweeps_move_a_pinned_body_that_turns_in_every_order(order):
     """Two bodies on a wheel whose centre is fixed: a colour must not contain both of its contacts."""
     rows = lv.Rows(
-        inv_mass=[0.0, 1.0, 1.0], inv_inertia=np.array([np.eye(3)] * 3),
+        inv_mass=[0.0, 1.0, 1.0],
+        inv_inertia=np.array([np.eye(3)] * 3),
         v_free=[[0.0] * 6, [0.0, 0.0, -1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -2.0, 0.0, 0.0, 0.0]],
-        normal=[[0.0, 0.0, 1.0]] * 2, tangent=[[1.0, 0.0, 0.0]] * 2, arm_a=[[1.0, 0.0, 0.0], [-0.5, 0.2, 0.0]],
-        arm_b=[[0.0, 0.0, 0.0]] * 2, contact_body=[[0, 1], [0, 2]],
-    )  # fmt: skip
+        normal=[[0.0, 0.0, 1.0]] * 2,
+        tangent=[[1.0, 0.0, 0.0]] * 2,
+        arm_a=[[1.0, 0.0, 0.0], [-0.5, 0.2, 0.0]],
+        arm_b=[[0.0, 0.0, 0.0]] * 2,
+        contact_body=[[0, 1], [0, 2]],
+    )
     problem = lv.Problem.from_rows(rows, mu=0.3)
     assert rows.moving_block_bodies.tolist() == [[0, 1], [0, 2]]
     assert find_islands(problem)[0] == 1
@@ -746,7 +801,8 @@ def test_recorder_with_every_and_keep_worst_keeps_selected_steps(tmp_path):
 
 @pytest.mark.parametrize("speed", [1e4, 1.0, 1e-3])
 def test_solution_to_a_velocity_error_is_converged_exactly_if_it_meets_it(speed):
-    (a, b), statuses = spd(8, seed=1), set()
+    (a, b) = spd(8, seed=1)
+    statuses = set()
     problem = lv.Problem.lcp(a, speed * np.abs(b))
     for n in range(1, 80):
         solution = lv.solve(problem, "pgs", velocity_tol=1e-3, max_iter=n)

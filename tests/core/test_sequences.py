@@ -35,12 +35,19 @@ def rounded(x):
 
 def on_exact_velocities(problem):
     """Return the same contacts over M = 1, with J, v* and targets that are multiples of 1/256."""
-    jac, rng = rounded(problem.jacobian.toarray()), np.random.default_rng(problem.m)
-    free, target = rounded(rng.normal(size=jac.shape[1])), rounded(rng.normal(size=problem.m))
+    jac = rounded(problem.jacobian.toarray())
+    rng = np.random.default_rng(problem.m)
+    free = rounded(rng.normal(size=jac.shape[1]))
+    target = rounded(rng.normal(size=problem.m))
     return lv.Problem.from_jacobian(
-        jac, np.eye(jac.shape[1]), free, target=target, cones=problem.cones, compliance=problem.compliance,
+        jac,
+        np.eye(jac.shape[1]),
+        free,
+        target=target,
+        cones=problem.cones,
+        compliance=problem.compliance,
         friction=problem.friction,
-    )  # fmt: skip
+    )
 
 
 @functools.cache
@@ -98,8 +105,20 @@ class Calls(RuleBasedStateMachine):
         assert facts(found) == facts(expected)
         return self.problem, found
 
-    @rule(target=solutions, more=st.sampled_from([{}, {"tol": 1e-3}, {"tol": 1e-10}, {"velocity_tol": 1e-3},
-          {"time_limit": 600.0}, {"max_iter": 1}, {"max_iter": 5}]))  # fmt: skip
+    @rule(
+        target=solutions,
+        more=st.sampled_from(
+            [
+                {},
+                {"tol": 1e-3},
+                {"tol": 1e-10},
+                {"velocity_tol": 1e-3},
+                {"time_limit": 600.0},
+                {"max_iter": 1},
+                {"max_iter": 5},
+            ]
+        ),
+    )
     def solve_again(self, more):
         return self.compare({}, **more)
 
@@ -126,7 +145,8 @@ class Calls(RuleBasedStateMachine):
     @rule(target=solutions, value=numbers, entry=st.integers(0, 99), with_b=st.booleans())
     def give_v_free(self, value, entry, with_b):
         general, jac = self.problem.generalized, self.problem.jacobian
-        free, b = general.v_free.copy(), rounded(0.5 * self.problem.b)
+        free = general.v_free.copy()
+        b = rounded(0.5 * self.problem.b)
         target = self.problem.b + jac @ free  # It stays where b is not given.
         free[entry % len(free)] = value
         b = b if with_b else target - jac @ free
@@ -135,7 +155,8 @@ class Calls(RuleBasedStateMachine):
 
     @rule(target=solutions, before=solutions, i=st.integers(0, 99), pair=st.booleans())
     def carry_to_another_problem(self, before, i, pair):
-        self.problem, (old, solution) = self.pool[i % len(self.pool)], before
+        self.problem = self.pool[i % len(self.pool)]
+        (old, solution) = before
         if not registry.get(self.solver).impulse:
             return self.compare({"problem": self.problem})
         start = carry_by_keys(old, solution.impulse, self.problem)

@@ -65,11 +65,9 @@ def test_the_typed_keywords_of_problems_are_those_that_their_methods_accept() ->
 def test_cones_and_problems_from_lists_equal_those_from_arrays() -> None:
     cones = lv.Cones(ptr=[0, 1], kind=[0], lower=[0.0], upper=[1], mu=[0.0], patch_radius=[0.0])
     assert cones == lv.Cones.bounded([0], [1.0]) == lv.Cones.bounded(np.zeros(1), 1.0)
-    problem, guess, key = (
-        lv.Problem([1], cones, [[2.0]], guess=[0.5], key=[3], names=["a"]),
-        np.full(1, 0.5),
-        np.array([3]),
-    )
+    problem = lv.Problem([1], cones, [[2.0]], guess=[0.5], key=[3], names=["a"])
+    guess = np.full(1, 0.5)
+    key = np.array([3])
     assert problem == lv.Problem(np.ones(1), cones, np.full((1, 1), 2.0), guess=guess, key=key, names=("a",))
     assert lv.Problem.lcp([[2.0]], [1], [0], [1]).cones == cones
     general = lv.Problem.from_jacobian([[1.0]], [[0.5]], [-1], cones=cones, target=[0], compliance=[0.1])
@@ -98,11 +96,21 @@ def test_register_of_a_class_without_base_is_accepted(register: Any) -> None:
 @pytest.mark.parametrize("bodies", [0, 2])
 def test_rows_of_empty_lists_have_no_contacts_joints_or_bodies(bodies: int) -> None:
     """A loop over the contacts of a step gives empty lists if there are none."""
-    mass, inertia, free = [1.0] * bodies, [np.eye(3)] * bodies, [np.ones(6)] * bodies
+    mass = [1.0] * bodies
+    inertia = [np.eye(3)] * bodies
+    free = [np.ones(6)] * bodies
     rows = lv.Rows(
-        mass, inertia, free, jac=EMPTY, joint_body=EMPTY, contact_body=EMPTY, normal=EMPTY, tangent=EMPTY, arm_a=EMPTY,
+        mass,
+        inertia,
+        free,
+        jac=EMPTY,
+        joint_body=EMPTY,
+        contact_body=EMPTY,
+        normal=EMPTY,
+        tangent=EMPTY,
+        arm_a=EMPTY,
         arm_b=EMPTY,
-    )  # fmt: skip
+    )
     assert rows == lv.Rows(np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6)))
     problem = lv.Problem.from_rows(rows, target=EMPTY, mu=EMPTY)
     assert problem.m == 0 and lv.solve(problem).success

@@ -14,12 +14,22 @@ from worked import after
 import lavender as lv
 
 SCENES = (
-    ("stack", {"n": 12}), ("stack", {"n": 4, "size": 0.5, "mass": 60.0}), ("pyramid", {"base": 6}),
-    ("card_house", {"levels": 2}), ("pile", {"n": 40, "size": 0.3}), ("pile", {"n": 30, "kind": "boxes", "size": 0.3}),
-    ("bridge", {}), ("bridge", {"n": 8, "load": 3.0}), ("heavy_on_light", {}),
-    ("heavy_on_light", {"ratio": 10.0, "n": 4}), ("table", {}),
-    ("ramp", {}), ("ramp", {"angle": 0.6}), ("stack", {"n": 2}), ("card_house", {"levels": 3}),
-)  # fmt: skip
+    ("stack", {"n": 12}),
+    ("stack", {"n": 4, "size": 0.5, "mass": 60.0}),
+    ("pyramid", {"base": 6}),
+    ("card_house", {"levels": 2}),
+    ("pile", {"n": 40, "size": 0.3}),
+    ("pile", {"n": 30, "kind": "boxes", "size": 0.3}),
+    ("bridge", {}),
+    ("bridge", {"n": 8, "load": 3.0}),
+    ("heavy_on_light", {}),
+    ("heavy_on_light", {"ratio": 10.0, "n": 4}),
+    ("table", {}),
+    ("ramp", {}),
+    ("ramp", {"angle": 0.6}),
+    ("stack", {"n": 2}),
+    ("card_house", {"levels": 3}),
+)
 STEPS = (2, 45)
 MAX_OVERLAP = 1e-3  # m
 OVERLAP_FRACTION_PER_STEP = 0.2  # of an overlap, that one step removes
@@ -49,7 +59,8 @@ class Step:
         c = self.cones
         if self.rows is None:
             return lv.Problem.from_jacobian(self.jac, self.mass, self.v_free, target=self.target, cones=c)
-        rows, kj = replace(self.rows, v_free=self.v_free.reshape(-1, 6)), self.rows.n_joints
+        rows = replace(self.rows, v_free=self.v_free.reshape(-1, 6))
+        kj = self.rows.n_joints
         mj = len(rows.jac)
         bounds = {"lower": c.lower[:mj], "upper": c.upper[:mj]}
         return lv.Problem.from_rows(rows, self.target, mu=c.mu[kj:], tangents=c.n_tangents[kj:], **bounds)
@@ -68,7 +79,9 @@ class Step:
     def with_axes(self, order, sign=1.0):
         """Return the step with normal and tangents in another order; the targets move with them."""
         at = self.contacts
-        jac, target, rows = self.jac.copy(), self.target.copy(), self.rows
+        jac = self.jac.copy()
+        target = self.target.copy()
+        rows = self.rows
         jac[at], target[at] = self.jac[at[:, order]], self.target[at[:, order]]
         jac[at[:, 0]] *= sign
         if rows is not None:
@@ -116,7 +129,8 @@ def scene_step(name, parameters, steps):
     """Return a step of a scene as bodies; None if it has no contacts."""
     simulation = after(steps, name, **parameters)
     p = simulation.constraint_problem()
-    rows, contact = p.rows, p.cones.normal_rows
+    rows = p.rows
+    contact = p.cones.normal_rows
     if rows is None or not len(contact):
         return None
     given = simulation.scene.parameters

@@ -18,10 +18,13 @@ def test_redundancy_of_two_equal_hinges_names_the_second():
     rng = np.random.default_rng(3)
     jac = rng.normal(size=(5, 12))
     rows = lv.Rows(
-        inv_mass=[1.0, 0.5, 2.0], inv_inertia=np.tile(np.eye(3), (3, 1, 1)), v_free=rng.normal(size=(3, 6)),
-        jac=np.vstack([jac, jac, rng.normal(size=(2, 12))]), joint_ptr=[0, 5, 10, 12],
+        inv_mass=[1.0, 0.5, 2.0],
+        inv_inertia=np.tile(np.eye(3), (3, 1, 1)),
+        v_free=rng.normal(size=(3, 6)),
+        jac=np.vstack([jac, jac, rng.normal(size=(2, 12))]),
+        joint_ptr=[0, 5, 10, 12],
         joint_body=[[0, 1], [0, 1], [1, 2]],
-    )  # fmt: skip
+    )
     problem = lv.Problem.from_rows(rows, names=["hinge", "spare hinge", "rod"])
     found = redundancy(problem)
     assert found.rank == 7
@@ -35,7 +38,8 @@ def test_redundancy_of_two_equal_hinges_names_the_second():
 def test_redundancy_of_an_indefinite_matrix_has_its_rank(seed):
     rng = np.random.default_rng(seed)
     m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
-    g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
+    g = rng.normal(size=(m, r))
+    signs = rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
     a = g * signs @ g.T
     a = np.block([[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]])
     problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
@@ -56,7 +60,8 @@ def test_redundancy_keeps_a_row_that_differs_by_more_than_tol(share):
     jac[3] = rng.normal(size=3) @ jac[:3]
     jac[3] = jac[3] / np.linalg.norm(jac[3]) + share * new
     problem = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), cones=lv.Cones.free(4))
-    kept, dropped = redundancy(problem), redundancy(problem, tol=10.0 * share)
+    kept = redundancy(problem)
+    dropped = redundancy(problem, tol=10.0 * share)
     assert (kept.rank, dropped.rank) == (4, 3)
     assert kept.tol == 1e-12 and dropped.tol == 10.0 * share
     assert redundancy(replace(problem, precision="float32")).rank == (4 if share > 1e-6 else 3)
@@ -65,7 +70,8 @@ def test_redundancy_keeps_a_row_that_differs_by_more_than_tol(share):
 
 
 def test_redundancy_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
-    rng, m = np.random.default_rng(1), 300
+    rng = np.random.default_rng(1)
+    m = 300
     jac = sp.csr_array(sp.random_array((m, 240), density=4.0 / 240, rng=rng))
     jac = jac[np.diff(jac.indptr) > 0]
     a = sp.csr_array(jac @ jac.T)

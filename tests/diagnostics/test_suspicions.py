@@ -27,7 +27,8 @@ def given(problem):
 
 
 def made(problem, rows, target):
-    c, kj = problem.cones, problem.rows.n_joints
+    c = problem.cones
+    kj = problem.rows.n_joints
     mj = len(rows["jac"])
     return lv.Problem.from_rows(
         lv.Rows(**rows), target, lower=c.lower[:mj], upper=c.upper[:mj], mu=c.mu[kj:], tangents=c.n_tangents[kj:]
@@ -125,7 +126,8 @@ def test_diagnose_of_a_matrix_with_opposed_rows_reports_it():
 
 
 def test_diagnose_with_velocities_of_a_planar_engine_finds_wrong_ones():
-    dt, velocity = 0.01, np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
+    dt = 0.01
+    velocity = np.array([(0.3, -0.2, 1.0), (0.0, 0.0, 0.0)])
 
     def diagnose(after, given):
         builder = lv.RowBuilder([1.0, 0.5], [6.0, 3.0], after, dt, [(0.0, 0.5), (3.0, 0.5)])
@@ -146,7 +148,9 @@ def test_diagnose_with_velocities_of_a_planar_engine_finds_wrong_ones():
 @pytest.mark.parametrize(("mass", "size"), [(100.0, 1.0), (1000.0, 2.0)])
 def test_diagnose_of_masses_as_inverse_masses_reports_them_in_space_only(mass, size):
     """Check the statement of docs/failures.md."""
-    inertia, dt, corners = mass * size**2 / 6, 1 / 60, (-size / 2, size / 2)
+    inertia = mass * size**2 / 6
+    dt = 1 / 60
+    corners = (-size / 2, size / 2)
     plane = lv.RowBuilder([mass], [inertia], [(0.0, -9.81 * dt, 0.0)], dt, [(0.0, size / 2)])
     space = lv.RowBuilder(
         [mass], [inertia * np.eye(3)], [(0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0)], dt, [(0.0, 0.0, size / 2)]
@@ -160,7 +164,9 @@ def test_diagnose_of_masses_as_inverse_masses_reports_them_in_space_only(mass, s
 
 
 def test_diagnose_of_a_bounce_with_a_gap_reports_nothing():
-    dt, fall, e = 0.01, np.array([-2.0, -3.0]), 0.5
+    dt = 0.01
+    fall = np.array([-2.0, -3.0])
+    e = 0.5
     gap = np.array([0.01, 0.02])  # m, closed within the step
 
     def found(target):
@@ -228,11 +234,16 @@ def thin_wall(entry, as_bodies):
         jac = np.array([[entry, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return lv.Problem.from_jacobian(jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones)
     jac = np.zeros((2, 12))
-    jac[0, 6], jac[1, 8] = entry, 1.0
+    jac[0, 6] = entry
+    jac[1, 8] = 1.0
     rows = lv.Rows(
-        inv_mass=[2.0], inv_inertia=[np.eye(3)], v_free=[[0.2, -0.1, -0.00981, 0.0, 0.0, 0.0]], jac=jac,
-        joint_ptr=[0, 1, 2], joint_body=[(-1, 0)] * 2,
-    )  # fmt: skip
+        inv_mass=[2.0],
+        inv_inertia=[np.eye(3)],
+        v_free=[[0.2, -0.1, -0.00981, 0.0, 0.0, 0.0]],
+        jac=jac,
+        joint_ptr=[0, 1, 2],
+        joint_body=[(-1, 0)] * 2,
+    )
     return lv.Problem.from_rows(rows, target=[0.05, 0.0], lower=[0.0, 0.0])
 
 
@@ -263,9 +274,12 @@ def test_diagnose_limit_of_impulses_grows_with_the_rows(copies):
         jac = np.kron(np.eye(copies), one.jac.toarray())
         jac[0, 0] = 0.05 * 0.5 / push
         problem = lv.Problem.from_jacobian(
-            jac, 0.5 * np.eye(3 * copies), np.tile(one.v_free, copies), target=np.tile([0.05, 0.0], copies),
+            jac,
+            0.5 * np.eye(3 * copies),
+            np.tile(one.v_free, copies),
+            target=np.tile([0.05, 0.0], copies),
             cones=lv.Cones.contacts(0.0, count=2 * copies, tangents=0),
-        )  # fmt: skip
+        )
         solution = lv.solve(problem, tol=1e-9)
         assert solution.success and jac[0, 0] * solution.impulse[0] == pytest.approx(push, rel=0.01)
         assert ("impulses" in kinds(problem, solution.impulse)) == reported, factor
@@ -273,7 +287,8 @@ def test_diagnose_limit_of_impulses_grows_with_the_rows(copies):
 
 def test_diagnose_asks_for_forces_only_if_a_time_step_makes_impulses_of_them():
     """A heavy body on a light one: 1 % off, the impulses err more than the zero impulse, and are no forces."""
-    jac, mass = np.array([[1.0, 0.0], [-1.0, 1.0]]), np.diag([1.0, 1e6])
+    jac = np.array([[1.0, 0.0], [-1.0, 1.0]])
+    mass = np.diag([1.0, 1e6])
     problem = lv.Problem.from_jacobian(jac, mass, [-0.1, -0.1], cones=lv.Cones.bounded(np.zeros(2), np.full(2, np.inf)))
     solved = lv.solve(problem, tol=1e-12).impulse
     near = solved * [1.0, 1.01]

@@ -67,7 +67,8 @@ class Library:
 
     def problem(self, given, **more):
         """A problem of the package as the library takes it, with the arrays that it points to."""
-        found, made = make_problem_view(given), Problem()
+        found = make_problem_view(given)
+        made = Problem()
         made.size = ct.sizeof(Problem)
         for key, value in zip(COUNTS, found.counts, strict=True):
             setattr(made, key, value)
@@ -111,7 +112,10 @@ class Refused(Exception):
 
 class Solver:
     def __init__(self, library, at, memory, problem):
-        self.library, self.at, self.memory, self.m = library, at, memory, problem.n_rows
+        self.library = library
+        self.at = at
+        self.memory = memory
+        self.m = problem.n_rows
 
     def set(self, problem):
         code = self.library.c.lav_set(self.at, ct.byref(problem))

@@ -33,8 +33,20 @@ def compiler():
 @pytest.fixture(scope="session")
 def shared(folder, compiler):
     out = folder / "liblavender.so"
-    run(compiler, "-std=c11", "-O0", "-fPIC", "-shared", "-DLAV_SHARED", "-fvisibility=hidden", "-ffp-contract=off",
-        folder / "lavender.c", "-lm", "-o", out)  # fmt: skip
+    run(
+        compiler,
+        "-std=c11",
+        "-O0",
+        "-fPIC",
+        "-shared",
+        "-DLAV_SHARED",
+        "-fvisibility=hidden",
+        "-ffp-contract=off",
+        folder / "lavender.c",
+        "-lm",
+        "-o",
+        out,
+    )
     return out
 
 

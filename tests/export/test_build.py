@@ -40,7 +40,8 @@ LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17":
     ],
 )
 def test_exported_library_compiles_without_warnings_in_c_and_cpp(folder, tmp_path, name, language, small):
-    command, quick = [name], ["-fsyntax-only"]
+    command = [name]
+    quick = ["-fsyntax-only"]
     if name == "clang" and shutil.which(name) is None:  # zig's compiler is clang's
         pytest.importorskip("ziglang", reason="neither clang nor ziglang is installed (extra: wasm)")
         command = [sys.executable, "-m", "ziglang", "cc", "-Wno-unused-command-line-argument"]
@@ -147,14 +148,17 @@ def test_c_library_passes_sanitizers(folder, tmp_path, name, what):
 
 def write_vectors(out):
     given = [
-        (self_test_problem(), "sequential_impulses", {}), (self_test_problem(), "anderson", {"memory": 3}),
+        (self_test_problem(), "sequential_impulses", {}),
+        (self_test_problem(), "anderson", {"memory": 3}),
         (rp.random_contact_problem(4), "block_gauss_seidel", {"order": "symmetric"}),
         (rp.random_contact_problem(5, "cone"), "nncg", {"restart": "against"}),
         (lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, 0.5]), "direct", {}),
-        (rp.random_contact_problem(6), "auto", {}), (rp.random_contact_problem(7), "admm", {}),
+        (rp.random_contact_problem(6), "auto", {}),
+        (rp.random_contact_problem(7), "admm", {}),
         *((of_matrix(given), "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
-        (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
-    ]  # fmt: skip
+        (rp.random_lcp(3, m=8), "lemke", {}),
+        (rp.random_lcp(3, m=8), "newton", {}),
+    ]
     packed = [vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]
     (out / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(packed)

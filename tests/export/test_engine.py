@@ -11,7 +11,9 @@ from lavender_ext.engine.arrays import make_array_views
 
 
 def opened(library, image):
-    c, workspace, at = library.c, ct.c_uint64(), ct.c_void_p()
+    c = library.c
+    workspace = ct.c_uint64()
+    at = ct.c_void_p()
     assert c.lav_engine_workspace_size(image, ct.c_uint64(len(image)), ct.byref(workspace)) == 0
     memory = (ct.c_double * (workspace.value // 8 + 2))()
     assert c.lav_engine_open(memory, workspace, image, ct.c_uint64(len(image)), ct.byref(at)) == 0

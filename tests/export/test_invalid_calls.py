@@ -27,7 +27,8 @@ class Guarded:
     """A solver in memory of exactly so many bytes, with marked bytes before and behind."""
 
     def __init__(self, library, problem, options, bytes_):
-        self.c, self.bytes = library.c, bytes_
+        self.c = library.c
+        self.bytes = bytes_
         self.memory = (ct.c_ubyte * (bytes_ + 256))(*([CANARY] * (bytes_ + 256)))
         self.at = ct.c_void_p()
         begin = ct.addressof(self.memory) + 128
@@ -41,7 +42,8 @@ class Guarded:
 
 
 def open_solver(library, method="sequential_impulses"):
-    problem, options = library.problem(self_test_problem()), library.options(method)
+    problem = library.problem(self_test_problem())
+    options = library.options(method)
     solver = Guarded(library, problem, options, library.workspace(problem, options).value)
     assert solver.code == 0
     return solver, problem
@@ -71,19 +73,23 @@ def set_array(key, values):
 
 
 MISTAKES = {
-    "struct of another version": (set_field("size", 8), "VERSION"), "form": (set_field("form", 9), "OPTION"),
-    "law": (set_field("law", 5), "OPTION"), "rows below 0": (set_field("n_rows", -3), "COUNT"),
+    "struct of another version": (set_field("size", 8), "VERSION"),
+    "form": (set_field("form", 9), "OPTION"),
+    "law": (set_field("law", 5), "OPTION"),
+    "rows below 0": (set_field("n_rows", -3), "COUNT"),
     "fewer rows than blocks": (set_field("n_rows", 3), "COUNT"),
     "entries below 0": (set_field("n_entries", -1), "COUNT"),
     "more joints than blocks": (set_field("n_joints", 99), "COUNT"),
     "joints that are contacts": (set_field("n_joints", 2), "BLOCKS"),
     "blocks that do not end": (change("block_ptr", -1, 35), "BLOCKS"),
     "blocks that go back": (change("block_ptr", 3, 1), "BLOCKS"),
-    "a block far away": (change("block_ptr", 4, 2**30), "BLOCKS"), "no such kind": (change("kind", 2, 7), "BLOCKS"),
+    "a block far away": (change("block_ptr", 4, 2**30), "BLOCKS"),
+    "no such kind": (change("kind", 2, 7), "BLOCKS"),
     "friction below 0": (change("mu", 1, -0.1), "FRICTION"),
     "friction not a number": (change("mu", 1, np.nan), "FRICTION"),
     "a body that is not there": (change("contact_body", 5, 3), "INDEX"),
-    "a body below the world": (change("contact_body", 5, -2), "INDEX"), "NaN in b": (change("b", 0, np.nan), "NUMBER"),
+    "a body below the world": (change("contact_body", 5, -2), "INDEX"),
+    "NaN in b": (change("b", 0, np.nan), "NUMBER"),
     "an infinite normal": (change("normal", 4, np.inf), "NUMBER"),
     "NaN in an inertia": (change("inv_inertia", 9, np.nan), "NUMBER"),
     "a mass below 0": (change("inv_mass", 1, -1.0), "MASS"),
@@ -94,7 +100,8 @@ MISTAKES = {
     "a normal of length 2": (change("normal", 14, 2.0), "FRAME"),
     "a tangent along the normal": (change("tangent", 14, 0.6), "FRAME"),
     "a body that touches itself": (change("contact_body", 10, 1), "PAIR"),
-    "two static bodies": (change("contact_body", 1, -1), "PAIR"), "no masses": (set_field("inv_mass", None), "NULL"),
+    "two static bodies": (change("contact_body", 1, -1), "PAIR"),
+    "no masses": (set_field("inv_mass", None), "NULL"),
     "no normals": (set_field("normal", None), "NULL"),
     "no bodies of contacts": (set_field("contact_body", None), "NULL"),
     "rolling below 0": (set_array("rolling", [-0.1] * 12), "FRICTION"),
@@ -102,14 +109,15 @@ MISTAKES = {
     "rows that do not roll": (change("kind", 2, 5), "BLOCKS"),
     "a box of one tangent": (lambda q: (change("kind", 2, 4)(q), change("block_ptr", 3, 8)(q)), "BLOCKS"),
     "an order with a block twice": (change("order", 1, 0), "INDEX"),
-}  # fmt: skip
+}
 
 
 #: Mistakes of several numbers, with their count: any of these is named.
 INEXACT_PLACES = {
     **dict.fromkeys(("a normal of length 0", "a normal of length 2", "a tangent along the normal"), 3),
-    **dict.fromkeys(("an inertia below 0", "an inertia that is not symmetric"), 9), "two static bodies": 2,
-}  # fmt: skip
+    **dict.fromkeys(("an inertia below 0", "an inertia that is not symmetric"), 9),
+    "two static bodies": 2,
+}
 ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a", "arm_b")
 
 
@@ -141,7 +149,10 @@ def test_c_library_of_an_invalid_problem_returns_the_array_and_index_of_its_faul
 
 
 def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_errors(library):
-    c, q, o, r = library.c, Problem(), Options(), Result()
+    c = library.c
+    q = Problem()
+    o = Options()
+    r = Result()
     assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
     assert c.lav_workspace_size(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
     nobody = (ct.c_double * 400)()
@@ -156,7 +167,8 @@ def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_erro
     budget.tol = np.nan
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
     for value in (np.nan, np.inf, -1e-5):
-        budget.tol, budget.velocity_tol = 0.0, value
+        budget.tol = 0.0
+        budget.velocity_tol = value
         assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
     budget.velocity_tol, budget.seconds = 0.0, 1.0
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -1  # a limit without a clock
@@ -167,8 +179,10 @@ def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_erro
 
 @pytest.mark.parametrize("method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"])
 def test_c_library_with_too_little_memory_returns_an_error_and_writes_inside_it(library, method):
-    problem, options = library.problem(self_test_problem()), library.options(method)
-    seen, workspace = set(), library.workspace(problem, options).value
+    problem = library.problem(self_test_problem())
+    options = library.options(method)
+    seen = set()
+    workspace = library.workspace(problem, options).value
     for bytes_ in [*range(0, workspace, workspace // 40), workspace]:
         solver = Guarded(library, problem, options, bytes_)
         if solver.code == 0:
@@ -185,12 +199,14 @@ def test_c_library_with_too_little_memory_returns_an_error_and_writes_inside_it(
 @pytest.mark.parametrize("method", METHODS)
 def test_c_solver_moved_to_more_memory_takes_a_larger_problem(library, method):
     """It keeps the impulses that it had; sweeps are moved at most once, factors at most three times."""
-    small, c = random_lcp(1, m=3), library.c
+    small = random_lcp(1, m=3)
+    c = library.c
     bodies = random_contact_problem(3, bodies=4, contacts=6)
     rng = np.random.default_rng(5)
     more = lv.Problem.linear(np.eye(60) + 0.01, rng.normal(size=60))
     free = lv.Problem.linear(np.eye(3) + 0.01, rng.normal(size=3))
-    towers, grown = [stack_of(n) for n in (1, 6)], 0
+    towers = [stack_of(n) for n in (1, 6)]
+    grown = 0
     for few, many in ((free, more), (small, random_lcp(2, m=60)), (as_matrix(bodies), as_matrix(towers[1])), towers):
         problems = [library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)]
         options = library.options(method)
@@ -199,12 +215,16 @@ def test_c_solver_moved_to_more_memory_takes_a_larger_problem(library, method):
         solver = library.open(problems[0], options)
         solver.run(50, 1e-6)
         before = solver.impulse()
-        code, asked = solver.set(problems[1]), 0
+        code = solver.set(problems[1])
+        asked = 0
         while code == -10:
             needed = c.lav_needed(solver.at)
-            memory, at = (ct.c_double * (needed // 8 + 2))(), ct.c_void_p()
+            memory = (ct.c_double * (needed // 8 + 2))()
+            at = ct.c_void_p()
             assert c.lav_move(solver.at, memory, ct.c_uint64(needed), ct.byref(at)) == 0
-            solver.at, solver.memory, asked = at, memory, asked + 1
+            solver.at = at
+            solver.memory = memory
+            asked = asked + 1
             code = solver.set(problems[1])
         assert code == 0 and asked <= (1 if method in (*SWEEPS, "sor", "gauss_seidel", "jacobi") else 3)
         grown += asked
@@ -230,7 +250,8 @@ def test_c_solver_that_is_running_rejects_other_calls(library):
 
     kind = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
     kept = kind(clock)
-    budget.seconds, budget.clock = 1e9, ct.cast(kept, ct.c_void_p).value
+    budget.seconds = 1e9
+    budget.clock = ct.cast(kept, ct.c_void_p).value
     assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
     assert set(said) == {-13} and out.iterations == 50
     budget.seconds = 3.0  # the clock goes on by two each time
@@ -241,7 +262,8 @@ def test_c_solver_that_is_running_rejects_other_calls(library):
 @pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
 def test_c_library_counting_memory_reads_only_the_ends_of_joints(library, form, method):
     # Addresses that nothing may be read from: whoever does ends this process.
-    problem, options = Problem(), library.options(method)
+    problem = Problem()
+    options = library.options(method)
     ptr = np.arange(0, 39, 3, dtype=np.int32)
     library.c.lav_default_problem(form, ct.byref(problem))
     for key, kind in Problem._fields_:
@@ -256,10 +278,15 @@ def stack_of(n):
     """n unit boxes on one another, by a contact each."""
     z = np.tile([0.0, 0.0, 1.0], (n, 1))
     rows = lv.Rows(
-        np.ones(n), np.tile(6.0 * np.eye(3), (n, 1, 1)), np.hstack([-z, 0.0 * z]), normal=z,
-        tangent=np.roll(z, 1, axis=1), arm_a=0.5 * z, arm_b=-0.5 * z,
+        np.ones(n),
+        np.tile(6.0 * np.eye(3), (n, 1, 1)),
+        np.hstack([-z, 0.0 * z]),
+        normal=z,
+        tangent=np.roll(z, 1, axis=1),
+        arm_a=0.5 * z,
+        arm_b=-0.5 * z,
         contact_body=np.arange(n)[:, None] + [-1, 0],
-    )  # fmt: skip
+    )
     return lv.Problem.from_rows(rows, mu=0.5, tangents=2)
 
 
@@ -272,7 +299,8 @@ REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_
 @pytest.mark.fuzz
 @given(st.data())
 def test_c_library_on_drawn_problems_writes_inside_its_memory(library, data):
-    problem, keep = Problem(), []
+    problem = Problem()
+    keep = []
     form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 12))
     library.c.lav_default_problem(form, ct.byref(problem))
     for key in COUNTS[1:]:
@@ -288,7 +316,8 @@ def test_c_library_on_drawn_problems_writes_inside_its_memory(library, data):
                 x[: len(values)] = np.abs(values) if key == "key" else values
             keep.append(x)
             setattr(problem, key, x.ctypes.data)
-    options, workspace = Options(), ct.c_uint64()
+    options = Options()
+    workspace = ct.c_uint64()
     library.c.lav_default_options(method, ct.byref(options))
     code = library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))
     assert code == 0 or code in ERRORS

@@ -46,7 +46,8 @@ def ill_conditioned(seed, friction):
     rng = np.random.default_rng(seed)
     mass = rp.conditioned(rng, 4, 1e10)
     cones = lv.Cones.contacts(0.5, count=2)
-    jac, v = rng.normal(size=(6, 4)), rng.normal(size=4)
+    jac = rng.normal(size=(6, 4))
+    v = rng.normal(size=4)
     return lv.Problem.from_jacobian(jac, mass, v, cones=cones, friction=friction)
 
 
@@ -77,9 +78,11 @@ def dense_velocities():
     """J and a full M, so few velocities that sweeps over A cost less: the package forms it."""
     for seed, friction in itertools.product(range(4), ("coulomb", "cone")):
         rng = np.random.default_rng(seed)
-        root, m = rng.normal(size=(24, 24)), 9 * (1 + seed)
+        root = rng.normal(size=(24, 24))
+        m = 9 * (1 + seed)
         cones = lv.Cones.contacts(0.5, count=m // 3) if seed else lv.Cones.contacts(0.0, count=m, tangents=0)
-        jac, mass = rng.normal(size=(m, 24)), np.eye(24) + 0.1 * root @ root.T
+        jac = rng.normal(size=(m, 24))
+        mass = np.eye(24) + 0.1 * root @ root.T
         yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=24), cones=cones, friction=friction)
 
 
@@ -110,7 +113,9 @@ def test_methods_are_numbered_and_named_as_in_the_header(library):
 def test_c_library_method_has_the_bits_of_the_package(library, at):
     """Where `solver.form` says that it swept over rows of A, on that matrix: `problem.csr` is the one to give."""
     given = SWEPT[at]
-    start, ran, formed = given.start(), 0, 0
+    start = given.start()
+    ran = 0
+    formed = 0
     try:
         problem = library.problem(given, impulse=start)
     except NotSupported as reason:
@@ -217,7 +222,8 @@ def test_c_workspace_size_exceeds_the_need_by_at_most_five_percent(library, meth
         problem, options = library.problem(given), library.options(method)
         if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
-        workspace, solver = library.workspace(problem, options).value, library.open(problem, options)
+        workspace = library.workspace(problem, options).value
+        solver = library.open(problem, options)
         needed = library.c.lav_needed(solver.at)
         assert needed <= workspace <= 1.05 * needed + 8192, (given.m, given.n_blocks)
         looked += 1
@@ -228,9 +234,13 @@ def test_c_workspace_size_exceeds_the_need_by_at_most_five_percent(library, meth
 @pytest.mark.parametrize("n_bodies", [3, 100, 2000])
 def test_c_workspace_of_pivots_counts_unmoved_bodies(library, method, n_bodies):
     rows = lv.Rows(
-        np.ones(n_bodies), np.tile(np.eye(3), (n_bodies, 1, 1)), np.ones((n_bodies, 6)),
-        jac=np.tile(np.eye(12)[6], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 1]],
-    )  # fmt: skip
+        np.ones(n_bodies),
+        np.tile(np.eye(3), (n_bodies, 1, 1)),
+        np.ones((n_bodies, 6)),
+        jac=np.tile(np.eye(12)[6], (2, 1)),
+        joint_ptr=[0, 1, 2],
+        joint_body=[[-1, 0], [-1, 1]],
+    )
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
     options = library.options(method)
     assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
@@ -278,8 +288,11 @@ def test_islands_immovable_bodies_and_stored_zeros_connect_nothing(library):
         "index": np.array([0, 1, 0, 1], np.int32),
         "value": dense.ravel(),
     }
-    mass = {"mass_ptr": np.array([0, 1, 3], np.int32), "mass_index": np.array([0, 0, 1], np.int32),
-            "mass_value": np.array([1.0, 0.0, 1.0])}  # fmt: skip
+    mass = {
+        "mass_ptr": np.array([0, 1, 3], np.int32),
+        "mass_index": np.array([0, 0, 1], np.int32),
+        "mass_value": np.array([1.0, 0.0, 1.0]),
+    }
     for given, arrays in (
         (lv.Problem(np.ones(2), cones, dense), stored),
         (lv.Problem.from_jacobian(dense, dense, [-1.0, -1.0], cones=cones), stored),
@@ -312,7 +325,8 @@ def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_doe
 
 def row_of_boxes(n):
     """n unit boxes on the ground in a row: each touches the next one, and the first is pushed against it."""
-    up, along = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n - 1, 1))
+    up = np.tile([0.0, 0.0, 1.0], (n, 1))
+    along = np.tile([1.0, 0.0, 0.0], (n - 1, 1))
     normal = np.vstack([up, along])
     body = np.vstack(
         [np.column_stack([np.full(n, -1), np.arange(n)]), np.column_stack([np.arange(n - 1), np.arange(1, n)])]
@@ -320,9 +334,15 @@ def row_of_boxes(n):
     v_free = np.tile([0.0, 0.0, -0.1, 0.0, 0.0, 0.0], (n, 1))
     v_free[0, 0] = 0.02
     rows = lv.Rows(
-        np.ones(n), np.tile(6.0 * np.eye(3), (n, 1, 1)), v_free, normal=normal,
-        tangent=np.roll(normal, 1, axis=1), arm_a=0.5 * normal, arm_b=-0.5 * normal, contact_body=body,
-    )  # fmt: skip
+        np.ones(n),
+        np.tile(6.0 * np.eye(3), (n, 1, 1)),
+        v_free,
+        normal=normal,
+        tangent=np.roll(normal, 1, axis=1),
+        arm_a=0.5 * normal,
+        arm_b=-0.5 * normal,
+        contact_body=body,
+    )
     return lv.Problem.from_rows(rows, mu=0.3, tangents=2)
 
 
@@ -421,7 +441,8 @@ def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler
     flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED", "-fPIC", "-shared", "-I", folder]
     run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")
     run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", tmp_path / "dump.c")
-    c, path = ct.CDLL(str(tmp_path / "dump.so")), tmp_path / "step.npz"
+    c = ct.CDLL(str(tmp_path / "dump.so"))
+    path = tmp_path / "step.npz"
     looked = set()
     for given in GIVEN:
         key = np.arange(given.n_blocks, dtype=np.uint64) + np.uint64(2**63)

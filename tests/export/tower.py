@@ -13,17 +13,22 @@ def self_test_problem():
     for v in velocity:
         v[2] = -9.81 / 60.0
     rows = lv.Rows(
-        inv_mass=inv_mass, inv_inertia=inertia, v_free=velocity, contact_body=[(c // 4 - 1, c // 4) for c in range(12)],
-        normal=[(0.0, 0.0, 1.0)] * 12, tangent=[(0.6, 0.8, 0.0)] * 12,
+        inv_mass=inv_mass,
+        inv_inertia=inertia,
+        v_free=velocity,
+        contact_body=[(c // 4 - 1, c // 4) for c in range(12)],
+        normal=[(0.0, 0.0, 1.0)] * 12,
+        tangent=[(0.6, 0.8, 0.0)] * 12,
         arm_a=[(0.0, 0.0, 0.0) if c < 4 else (*side[c % 4], 0.5) for c in range(12)],
         arm_b=[(*side[c % 4], -0.5) for c in range(12)],
-    )  # fmt: skip
+    )
     return lv.Problem.from_rows(rows, mu=[0.1 + 0.05 * c for c in range(12)])
 
 
 def hash_of(x, seed=0):
     """`lav_hash` of float64 numbers."""
-    h, full = seed, 2**64 - 1
+    h = seed
+    full = 2**64 - 1
     for bits in np.ascontiguousarray(x, np.float64).view(np.uint64).tolist():
         h = ((h ^ bits) * 0x9E3779B97F4A7C15) & full
         h ^= h >> 29

@@ -70,12 +70,14 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
     form, entries, bodies, joints, velocities, mass = 1, 0, 0, 0, 0, 0
     if problem.rows is not None:
-        r, form = problem.rows, 2
+        r = problem.rows
+        form = 2
         bodies, joints = r.n_bodies, r.n_joints
         arrays |= {f.name: getattr(r, f.name) for f in fields(r) if f.name in ARRAYS}
         arrays |= {"velocity": r.v_free, "compliance": problem.compliance}
     elif problem.generalized is not None:
-        g, form = problem.generalized, 3
+        g = problem.generalized
+        form = 3
         if g.order is not None:
             raise NotSupported(
                 "the C library needs M with the pattern of a tree; the factor of this M needed another "
@@ -84,7 +86,8 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
         arrays |= zip(("index_ptr", "index", "value"), g.operator.jac, strict=True)
         arrays |= zip(("mass_ptr", "mass_index", "mass_value"), g.operator.mass, strict=True)
         arrays |= {"velocity": g.v_free, "compliance": problem.compliance}
-        velocities, mass = g.operator.n, len(g.operator.mass[1])
+        velocities = g.operator.n
+        mass = len(g.operator.mass[1])
     else:
         a = problem.csr
         arrays |= {"index_ptr": a.indptr, "index": a.indices, "value": a.data}
@@ -112,7 +115,8 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     """Encode the options of a solver as five integers (order, memory, sweep, convex, keeps) and omega."""
     remaining = dict(options)
     order = remaining.pop("order", "given")
-    sweep, restart = remaining.pop("sweep", None), remaining.pop("restart", "growth")
+    sweep = remaining.pop("sweep", None)
+    restart = remaining.pop("restart", "growth")
     convex = remaining.pop("convex", None if solver == "anderson" else 0)
     numbers = (
         remaining.pop("memory", 10 if solver == "admm" else 5),
@@ -202,7 +206,8 @@ def make_test_vector(
             f"the C library's {solver} does not accept {problem.name or 'this problem'}: choose another "
             "solver; the function lav_takes tests whether a solver accepts a problem"
         )
-    impulse, relative = solution.impulse, solution.residual.relative
+    impulse = solution.impulse
+    relative = solution.residual.relative
     if solver == "newton" and (problem.generalized is None or form == "velocity"):
         impulse = run_compiled_newton(problem, tol, max_iter)[0]
         relative = lv.residual(problem, impulse, tol=tol).relative
@@ -220,7 +225,8 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[n
     # Make the judge compute d, nu and J M^-1 J^T, which the driver reads.
     lv.residual(problem, problem.start())
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
-    driver, outcome = Driver(problem.metric), OUTCOMES["more"]
+    driver = Driver(problem.metric)
+    outcome = OUTCOMES["more"]
     if not driver.fits:
         raise NotSupported("the C library's newton does not accept this problem; choose another solver (--solver)")
     driver.start(impulse, tol, budget)

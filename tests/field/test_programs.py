@@ -19,7 +19,8 @@ def mix_units(arrays, seed):
     """Return the program in other units of cost, rows and variables (powers of two), and the factors of x and cost."""
     rng = np.random.default_rng(seed)
     n = len(arrays["q"])
-    unit, cost = 2.0 ** rng.integers(-10, 11, n), 2.0 ** rng.integers(-20, 21)
+    unit = 2.0 ** rng.integers(-10, 11, n)
+    cost = 2.0 ** rng.integers(-20, 21)
     out = {
         "P": sp.diags_array(cost * unit) @ sp.csc_array(arrays["P"]) @ sp.diags_array(unit),
         "q": cost * arrays["q"] * unit,

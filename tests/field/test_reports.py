@@ -30,7 +30,8 @@ class Report:
 def make_paths(noise):
     """Send 1 from node 0 to node 2 at least cost: through node 1 for 1 + 1, or directly for 3."""
     rows = np.array([[-1.0, 0.0, -1.0], [1.0, -1.0, 0.0]])
-    cost, free = np.array([1.0, 1.0, 3.0]), np.zeros(3)
+    cost = np.array([1.0, 1.0, 3.0])
+    free = np.zeros(3)
     return lv.Problem.from_qp(np.zeros((3, 3)), cost, A=rows, b=np.array([-1.0, noise]), lb=free, ub=free + 10.0)
 
 
@@ -60,37 +61,73 @@ def drop_box(inside, restitution):
 
 def make_finger(points):
     """A finger that cannot turn and rests on a table with four points: each has the same row."""
-    jac, free = np.tile(np.eye(3)[[2, 0, 1]], (points, 1)), np.array([0.1, 0.0, -0.1])
+    jac = np.tile(np.eye(3)[[2, 0, 1]], (points, 1))
+    free = np.array([0.1, 0.0, -0.1])
     return lv.Problem.from_jacobian(jac, np.eye(3), free, cones=lv.Cones.contacts(np.full(points, 0.5)))
 
 
 REPORTS = [
     *(
-        Report(f"network flow, {noise:g} in place of 0 (0.3 - 0.1 - 0.2)", lambda noise=noise: make_paths(noise),
-               [1.0, 1.0, 0.0], None, ("auto", "clarabel", "piqp", "daqp", "highs"), 1e-6, 1e-4)
+        Report(
+            f"network flow, {noise:g} in place of 0 (0.3 - 0.1 - 0.2)",
+            lambda noise=noise: make_paths(noise),
+            [1.0, 1.0, 0.0],
+            None,
+            ("auto", "clarabel", "piqp", "daqp", "highs"),
+            1e-6,
+            1e-4,
+        )
         for noise in (0.0, 0.3 - 0.1 - 0.2, 1e-14)
     ),
     *(
-        Report(f"linear program with P = {p:g} I, as users regularise", lambda p=p: make_vertex(p), [1.0, 0.0, 0.0],
-               None, ("auto", "clarabel", "daqp", "highs", "quadprog"), 1e-9, 1e-4)
+        Report(
+            f"linear program with P = {p:g} I, as users regularise",
+            lambda p=p: make_vertex(p),
+            [1.0, 0.0, 0.0],
+            None,
+            ("auto", "clarabel", "daqp", "highs", "quadprog"),
+            1e-9,
+            1e-4,
+        )
         for p in (1e-8, 1e-9, 1e-12)
     ),
     *(
-        Report(f"box that falls, points inside by {inside}, e = {e}", lambda i=inside, e=e: drop_box(i, e),
-               [0.0, 0.0, 3.0 * e, 0.0, 0.0, 0.0], lambda p, s: p.velocity(s.impulse).ravel(), (), 1e-9, 1e-6)
-        for inside in (1.0, 0.4, 0.1) for e in (0.0, 0.5, 1.0)
+        Report(
+            f"box that falls, points inside by {inside}, e = {e}",
+            lambda i=inside, e=e: drop_box(i, e),
+            [0.0, 0.0, 3.0 * e, 0.0, 0.0, 0.0],
+            lambda p, s: p.velocity(s.impulse).ravel(),
+            (),
+            1e-9,
+            1e-6,
+        )
+        for inside in (1.0, 0.4, 0.1)
+        for e in (0.0, 0.5, 1.0)
     ),
     *(
-        Report(f"finger on a slide with {n} points", lambda n=n: make_finger(n), [0.05, 0.0, 0.0],
-               lambda p, s: p.velocity(s.impulse).ravel(), (), 1e-9, 1e-6)
+        Report(
+            f"finger on a slide with {n} points",
+            lambda n=n: make_finger(n),
+            [0.05, 0.0, 0.0],
+            lambda p, s: p.velocity(s.impulse).ravel(),
+            (),
+            1e-9,
+            1e-6,
+        )
         for n in (1, 4)
     ),
     *(
-        Report(f"constant force, |b| about {size:g}", lambda size=size: make_constant_force(size), 1.0,
-               lambda p, s: s.impulse[0], ("newton", "admm", "auto"), 1e-9)
+        Report(
+            f"constant force, |b| about {size:g}",
+            lambda size=size: make_constant_force(size),
+            1.0,
+            lambda p, s: s.impulse[0],
+            ("newton", "admm", "auto"),
+            1e-9,
+        )
         for size in (0.0, 1e-18, 1e-3)
     ),
-]  # fmt: skip
+]
 
 
 def list_rows():
@@ -136,12 +173,16 @@ def test_start_with_a_higher_objective_than_nothing_is_replaced_by_every_call():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         contacts, n = int(rng.integers(2, 8)), int(rng.integers(6, 20))
-        jac, free, mu = rng.standard_normal((3 * contacts, n)), rng.standard_normal(n), np.full(contacts, 0.5)
+        jac = rng.standard_normal((3 * contacts, n))
+        free = rng.standard_normal(n)
+        mu = np.full(contacts, 0.5)
         problem = lv.Problem.from_jacobian(jac, np.eye(n), free, cones=lv.Cones.contacts(mu), friction="cone")
         start = np.tile([1e3, 100.0, -100.0], contacts)
         assert 0.5 * start @ problem.dense() @ start > problem.b @ start
         calls = (
-            lv.solve(problem, "newton", impulse=start), lv.solve(problem, "newton", impulse=start, max_iter=1000),
-            lv.prepare(problem, "newton").solve(impulse=start), lv.solve(problem, "newton"),
-        )  # fmt: skip
+            lv.solve(problem, "newton", impulse=start),
+            lv.solve(problem, "newton", impulse=start, max_iter=1000),
+            lv.prepare(problem, "newton").solve(impulse=start),
+            lv.solve(problem, "newton"),
+        )
         assert len({(found.iterations, found.impulse.tobytes()) for found in calls}) == 1

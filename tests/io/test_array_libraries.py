@@ -24,7 +24,9 @@ class HostArray:
     """An array of another library in host memory, which only the DLPack protocol can read."""
 
     def __init__(self, array):
-        self.array, self.shape, self.dtype = array, array.shape, array.dtype
+        self.array = array
+        self.shape = array.shape
+        self.dtype = array.dtype
 
     def __dlpack__(self, **options):
         return self.array.__dlpack__(**options)
@@ -46,7 +48,9 @@ class DeviceArray:
     device = "cuda:0"
 
     def __init__(self, array):
-        self.array, self.shape, self.copies = array, array.shape, 0
+        self.array = array
+        self.shape = array.shape
+        self.copies = 0
 
     def __dlpack__(self, **options):
         raise BufferError("the device is not supported")
@@ -131,8 +135,14 @@ class StandardArray(HostArray):
 
 
 RESIDUAL_ARRAYS = (
-    "relative", "energy", "velocity_error", "velocity_at_zero", "impulse_error", "roundoff_floor", "worst_row",
-)  # fmt: skip
+    "relative",
+    "energy",
+    "velocity_error",
+    "velocity_at_zero",
+    "impulse_error",
+    "roundoff_floor",
+    "worst_row",
+)
 SOLUTION_ARRAYS = (*RESIDUAL_ARRAYS, "impulse", "velocity", "iterations", "success")
 
 
@@ -161,10 +171,16 @@ def test_solve_returns_arrays_of_the_library_of_its_arguments():
 
 def test_impulses_of_from_efc_return_in_the_callers_library():
     efc = {
-        "efc_J": np.eye(2)[None], "efc_D": np.ones((1, 2)), "efc_aref": np.zeros((1, 2)), "efc_type": [3, 3],
-        "M": np.eye(2)[None], "qvel": np.zeros((1, 2)), "qacc_smooth": -np.ones((1, 2)), "timestep": 0.01,
+        "efc_J": np.eye(2)[None],
+        "efc_D": np.ones((1, 2)),
+        "efc_aref": np.zeros((1, 2)),
+        "efc_type": [3, 3],
+        "M": np.eye(2)[None],
+        "qvel": np.zeros((1, 2)),
+        "qacc_smooth": -np.ones((1, 2)),
+        "timestep": 0.01,
         "efc_force": np.ones((1, 2)),
-    }  # fmt: skip
+    }
     impulse = lv.io.from_efc(**efc, like=StandardArray(np.zeros(1))).impulse
     assert isinstance(impulse, StandardArray)
     np.testing.assert_array_equal(impulse.array, lv.io.from_efc(**efc).impulse)

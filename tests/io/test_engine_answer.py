@@ -29,7 +29,7 @@ MORE = {
     "tendon": '<tendon><fixed name="t" limited="true" range="-.1 .1" damping=".2" frictionloss=".1">'
     '<joint joint="first" coef="1"/><joint joint="second" coef="-1"/></fixed></tendon>',
     "weld": '<equality><weld body1="b" body2="d" torquescale=".3"/></equality>',
-}  # fmt: skip
+}
 # Integrator, damping of the joints, flag eulerdamp, and what moves the bodies.
 INTEGRATORS = {
     "Euler": ("Euler", 0.0, "enable", "acceleration"),
@@ -48,9 +48,15 @@ def make_model(integrator, cone, solver, feature, iterations):
     if kind == "discrete" and not HAS_DISCRETE:
         pytest.skip("this MuJoCo has no integrator discrete")
     xml = MODEL.format(
-        integrator=kind, cone=cone, solver=solver, iterations=iterations, eulerdamp=eulerdamp, damping=damping,
-        joint=JOINTS.get(feature, ""), more=MORE.get(feature, ""),
-    )  # fmt: skip
+        integrator=kind,
+        cone=cone,
+        solver=solver,
+        iterations=iterations,
+        eulerdamp=eulerdamp,
+        damping=damping,
+        joint=JOINTS.get(feature, ""),
+        more=MORE.get(feature, ""),
+    )
     return mj.MjModel.from_xml_string(xml)
 
 
@@ -111,7 +117,8 @@ def test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exa
         slips = np.linalg.norm(distances[is_elliptic].reshape(-1, 3)[:, 1:], axis=1)
         distance = max(distances.max(), slips.max(initial=0.0))
         for data in (forward, after):
-            problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+            problem = lv.io.from_mujoco(model, data)
+            impulse = adapter.impulse(model, data)
             found = lv.residual(problem, impulse)
             if found.at_floor:
                 assert distance < 1e-9
@@ -178,7 +185,8 @@ def test_from_mujoco_many_judges_and_predicts_as_single_steps(integrator, solver
 def test_a_saved_problem_keeps_the_motion_of_the_engine(tmp_path):
     model = make_model("Euler", "pyramidal", "PGS", "armature", iterations=2)
     for _, data, _ in iterate_steps(model):
-        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        impulse = adapter.impulse(model, data)
         lv.io.save(problem, tmp_path / "step.npz", impulse=impulse)
         stored = lv.io.read(tmp_path / "step.npz")
         found = lv.residual(stored.problem, stored.impulse)
@@ -205,7 +213,8 @@ def test_recorder_warns_of_a_step_that_its_answer_does_not_predict(integrator, t
             return recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))[0].prediction_gap
 
         assert [record() for _ in range(3)] == [0.0, 0.0, 0.0]
-        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        impulse = adapter.impulse(model, data)
         mj.mj_step(model, data)  # The data no longer belong to the problem.
         assert np.isnan(recorder.add(problem, impulse)[0].prediction_gap)
         mj.set_mjcb_control(lambda model, data: data.qfrc_applied.__setitem__(0, 5.0))
@@ -215,7 +224,8 @@ def test_recorder_warns_of_a_step_that_its_answer_does_not_predict(integrator, t
         finally:
             mj.set_mjcb_control(None)
         data.qvel[0] += 0.5  # A push of the user after the step.
-        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        impulse = adapter.impulse(model, data)
         with pytest.warns(UserWarning, match="differs by 5.0e-01"):
             assert recorder.add(problem, impulse)[0].prediction_gap == pytest.approx(0.5)
 

@@ -49,7 +49,9 @@ def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises(monkeypatch):
 
 def valid_files(folder):
     """Return (suffix, bytes) of a file in every layout."""
-    files, a, contacts = [], np.eye(6) + 0.1, lv.Cones.contacts(0.5, count=2)
+    files = []
+    a = np.eye(6) + 0.1
+    contacts = lv.Cones.contacts(0.5, count=2)
     for problem in (
         lv.Problem.lcp(a, np.ones(6), guess=np.ones(6)),
         lv.Problem(np.ones(6), contacts, sp.csr_array(a), friction="cone"),
@@ -65,14 +67,17 @@ def valid_files(folder):
     sparse = {"A_data": np.ones(3), "A_indices": np.arange(3), "A_indptr": np.arange(4), "A_shape": np.array([3, 3])}
     cones = {"cone_start": np.array([0]), "cone_dim": np.array([3]), "cone_mu": np.array([0.5])}
     plain = {"A": np.eye(3), "l_ref": np.ones(3), "w_ref": np.zeros(3), "compare": "l,w"}
-    mass, h = sp.csr_array(np.eye(6)), sp.csr_array(np.ones((6, 3)))
+    mass = sp.csr_array(np.eye(6))
+    h = sp.csr_array(np.ones((6, 3)))
     vectors = {"spacedim": np.array([3], np.int32), "vectors/f": np.ones(6), "vectors/w": np.zeros(3)}
     whole = matrix("M", 6, 6, -2, mass.indptr, mass.indices, mass.data) | vectors | {"vectors/mu": np.array([0.5])}
     whole |= matrix("H", 6, 3, -2, h.indptr, h.indices, h.data)
     return [
-        *files, (".npz", file_of(".npz", three | plain)), (".npz", file_of(".npz", three | sparse | cones)),
+        *files,
+        (".npz", file_of(".npz", three | plain)),
+        (".npz", file_of(".npz", three | sparse | cones)),
         (".hdf5", file_of(".hdf5", {f"fclib_global/{name}": x for name, x in whole.items()})),
-    ]  # fmt: skip
+    ]
 
 
 def arrays_in(suffix, data):
@@ -101,17 +106,35 @@ def file_of(suffix, arrays):
 
 #: Words for an entry in messages, if they are not its name.
 WORDS = {
-    "data": "values|A|J|M", "indices": "indices|M", "indptr": "pointers", "i": "indices", "p": "pointers",
-    "x": "values", "m": "rows|x|f", "n": "columns|x|w|rows", "lo": "lower", "hi": "upper", "b": "lo",
-    "nz": "compressed", "inv_mass": "inv_inertia", "v_free": "compressed", "A": "A_shape", "start": "cone_dim",
-}  # fmt: skip
+    "data": "values|A|J|M",
+    "indices": "indices|M",
+    "indptr": "pointers",
+    "i": "indices",
+    "p": "pointers",
+    "x": "values",
+    "m": "rows|x|f",
+    "n": "columns|x|w|rows",
+    "lo": "lower",
+    "hi": "upper",
+    "b": "lo",
+    "nz": "compressed",
+    "inv_mass": "inv_inertia",
+    "v_free": "compressed",
+    "A": "A_shape",
+    "start": "cone_dim",
+}
 
 
 def list_replacements(x):
     """Yield (description, array) in place of x; None: the entry is left out."""
     flat = x.reshape(-1)
-    yield from {"missing": None, "longer": np.concatenate([flat, flat[:1]]), "shorter": flat[:-1],
-                "a column": x.reshape(-1, 1, 1), "a scalar": np.array(2.5)}.items()  # fmt: skip
+    yield from {
+        "missing": None,
+        "longer": np.concatenate([flat, flat[:1]]),
+        "shorter": flat[:-1],
+        "a column": x.reshape(-1, 1, 1),
+        "a scalar": np.array(2.5),
+    }.items()
     if x.dtype.kind in "iuf":
         yield from {"text": np.full(x.shape, "a"), "complex": x.astype(complex)}.items()
         above = int(np.max(x, initial=0)) + 1 if x.dtype.kind in "iu" else 0  # the first number out of range
@@ -136,9 +159,11 @@ def read_replaced(path, suffix, arrays, name, x):
 
 @pytest.mark.filterwarnings("error")
 def test_file_with_an_array_replaced_names_it_or_is_read_as_approved(tmp_path):
-    unnamed, accepted = [], {}
+    unnamed = []
+    accepted = {}
     for suffix, data in valid_files(tmp_path):
-        arrays, path = arrays_in(suffix, data), tmp_path / f"replaced{suffix}"
+        arrays = arrays_in(suffix, data)
+        path = tmp_path / f"replaced{suffix}"
         kind = f"{suffix}, {', '.join(sorted({name.partition('_')[0].partition('/')[0] for name in arrays}))}"
         if kind in accepted:
             continue  # another problem in the same layout
@@ -147,7 +172,8 @@ def test_file_with_an_array_replaced_names_it_or_is_read_as_approved(tmp_path):
             last = name.rpartition("/")[2]
             words = [re.escape(w) for w in (last, last.replace("_", "."), last.partition("_")[2]) if w]
             words += [WORDS[key] for key in (last, last.rpartition("_")[2], last.partition("_")[2]) if key in WORDS]
-            pattern, read = re.compile(rf"{re.escape(str(path))}.*\b(?:{'|'.join(words)})\b", re.DOTALL), []
+            pattern = re.compile(rf"{re.escape(str(path))}.*\b(?:{'|'.join(words)})\b", re.DOTALL)
+            read = []
             for how, value in list_replacements(np.array(x)):
                 if suffix == ".hdf5" and how == "text":
                     continue  # HDF5 has no texts of NumPy.

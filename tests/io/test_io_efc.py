@@ -12,7 +12,9 @@ from lavender.io import mujoco as single
 
 
 def states_of(model, n, steps=40, seed=0):
-    rng, out, data = np.random.default_rng(seed), [], mj.MjData(model)
+    rng = np.random.default_rng(seed)
+    out = []
+    data = mj.MjData(model)
     while len(out) < n:
         mj.mj_resetData(model, data)
         data.qvel[:] = 0.5 * rng.standard_normal(model.nv)
@@ -63,7 +65,8 @@ def test_from_mujoco_many_of_a_state_equals_from_mujoco(cone, condim, jacobian):
 def test_from_mujoco_many_with_scratch_has_the_bits_of_calls_without_it():
     """Controls, warm starts and clamped numbers of an earlier call, and of one that failed, do not reach the next."""
     model = mj.MjModel.from_xml_string(scene())
-    scratch, states = lv.io.MujocoScratch(model), states_of(model, 6)
+    scratch = lv.io.MujocoScratch(model)
+    states = states_of(model, 6)
     data = forwarded(model, states[0])
     data.qfrc_applied[:], data.xfrc_applied[:], data.qacc_warmstart[:] = 3.0, 2.0, 7.0
     whole = np.tile(get_state(model, data), (2, 1))
@@ -98,7 +101,8 @@ def test_scratch_leaves_the_data_of_the_caller_unchanged():
         values = {name: getattr(own, name) for name in dir(own) if not name.startswith("_")}
         return {name: x.tobytes() for name, x in values.items() if isinstance(x, np.ndarray)}
 
-    before, scratch = list_arrays(), lv.io.MujocoScratch(model)
+    before = list_arrays()
+    scratch = lv.io.MujocoScratch(model)
     for _ in range(2):
         lv.io.from_mujoco_many(model, state + 0.01, errors="status", scratch=scratch)
     assert len(before) > 100 and list_arrays() == before
@@ -147,7 +151,8 @@ def test_from_mujoco_many_of_moving_surfaces_has_their_speed(cone):
     states[:, 2] -= 0.001
     states[:, 7:9] = np.random.default_rng(0).standard_normal((4, 2))
     batch, impulse = lv.io.from_mujoco_many(model, states)
-    found, dt = lv.residual_many(batch, impulse), model.opt.timestep
+    found = lv.residual_many(batch, impulse)
+    dt = model.opt.timestep
     for i, state in enumerate(states):
         data = forwarded(model, state)
         problem = lv.io.from_mujoco(model, data)
@@ -162,13 +167,17 @@ def test_from_mujoco_many_of_moving_surfaces_has_their_speed(cone):
 def stacked(model, states, dtype):
     """Arrays as MJX and Warp hold them: room for the most rows of all, in float32."""
     datas = [forwarded(model, s) for s in states]
-    m, n, nv = max(d.nefc for d in datas) + 3, len(datas), model.nv
+    m = max(d.nefc for d in datas) + 3
+    n = len(datas)
+    nv = model.nv
     jac = np.zeros((n, m, nv), dtype)
     of = np.zeros((n, m), int)
     rows = {name: np.ones((n, m), dtype) for name in ("efc_D", "efc_aref", "efc_frictionloss", "efc_force")}
-    mass, contacts = np.zeros((n, nv, nv)), [[], [], [], []]
+    mass = np.zeros((n, nv, nv))
+    contacts = [[], [], [], []]
     for i, d in enumerate(datas):
-        jac[i, : d.nefc], of[i, : d.nefc] = d.efc_J.reshape(-1, nv), d.efc_type
+        jac[i, : d.nefc] = d.efc_J.reshape(-1, nv)
+        of[i, : d.nefc] = d.efc_type
         for name, x in rows.items():
             x[i, : d.nefc] = getattr(d, name)
         mass[i] = whole_mass(model, d)
@@ -181,9 +190,15 @@ def stacked(model, states, dtype):
         for name in ("qvel", "qacc_smooth", "qfrc_smooth")
     }
     return {
-        "efc_J": jac, "efc_type": of, **rows, "M": mass.astype(dtype), **each, "timestep": model.opt.timestep,
-        "nefc": [d.nefc for d in datas], "contacts": tuple(np.array(x) for x in contacts),
-    }  # fmt: skip
+        "efc_J": jac,
+        "efc_type": of,
+        **rows,
+        "M": mass.astype(dtype),
+        **each,
+        "timestep": model.opt.timestep,
+        "nefc": [d.nefc for d in datas],
+        "contacts": tuple(np.array(x) for x in contacts),
+    }
 
 
 @pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3)])
@@ -230,14 +245,16 @@ def test_from_efc_does_not_read_rows_above_nefc(junk):
     batch, impulse = lv.io.from_efc(**given)
     for i, m in enumerate(given["nefc"]):
         np.testing.assert_array_equal(impulse[i], np.r_[clean.impulse[i, :m], np.zeros(len(impulse[i]) - m)])
-    many, same = lv.solve_many(batch, impulse=impulse), lv.solve_many(clean.batch, impulse=clean.impulse)
+    many = lv.solve_many(batch, impulse=impulse)
+    same = lv.solve_many(clean.batch, impulse=clean.impulse)
     np.testing.assert_array_equal(many.impulse, same.impulse)
 
 
 def test_from_efc_with_coulomb_law_changes_the_law_alone():
     model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
     given = stacked(model, states_of(model, 4), np.float64)
-    relaxed, rigid = lv.io.from_efc(**given), lv.io.from_efc(**given, friction="coulomb")
+    relaxed = lv.io.from_efc(**given)
+    rigid = lv.io.from_efc(**given, friction="coulomb")
     assert (relaxed.batch.friction, rigid.batch.friction) == ("cone", "coulomb")
     np.testing.assert_array_equal(relaxed.impulse, rigid.impulse)
     for i in range(len(rigid.batch)):  # only the law differs
@@ -277,7 +294,8 @@ def test_from_efc_of_coulomb_law_on_unsupported_contacts_raises():
 def test_scratch_of_a_call_that_raised_makes_other_data(monkeypatch):
     """MuJoCo may have left its stack as it was when it raised an error."""
     model = mj.MjModel.from_xml_string(scene())
-    scratch, states = lv.io.MujocoScratch(model), states_of(model, 1)
+    scratch = lv.io.MujocoScratch(model)
+    states = states_of(model, 1)
     lv.io.from_mujoco_many(model, states, scratch=scratch)
     used = scratch.take_data()
     scratch.keep_data(used)

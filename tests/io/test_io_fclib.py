@@ -112,8 +112,12 @@ def encoded(a, nz, spare=0):
         p, i, x = c.indptr, c.indices, c.data
     else:
         c = sp.coo_array(a)
-        p, i, x, nz = np.append(c.coords[1], rest), c.coords[0], c.data, c.nnz
-    x, i = np.append(x, np.full(spare, np.nan)), np.append(i, rest)
+        p = np.append(c.coords[1], rest)
+        i = c.coords[0]
+        x = c.data
+        nz = c.nnz
+    x = np.append(x, np.full(spare, np.nan))
+    i = np.append(i, rest)
     numbers = {"m": a.shape[0], "n": a.shape[1], "nz": nz, "nzmax": len(x)}
     out = {name: np.array([value], np.int32) for name, value in numbers.items()}
     return out | {"p": p.astype(np.int32), "i": i.astype(np.int32), "x": x}
@@ -128,7 +132,8 @@ def test_load_of_fclib_in_every_matrix_storage_gives_the_same_problem(tmp_path, 
     problem = lavender.io.load(make(tmp_path / "p.h5", W=encoded(W, nz, spare), q=np.arange(3.0), mu=[0.5]))
     assert np.array_equal(problem.dense(), W)
     assert np.array_equal(problem.b, -np.arange(3.0))
-    m, h = np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)])
+    m = np.diag([2.0, 4.0, 0.5, 1.0])
+    h = np.vstack([W, np.ones(3)])
     parts = {"M": encoded(m, nz, spare), "H": encoded(h, nz, spare)}
     problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(4.0), w=np.ones(3), mu=[0.5], **parts))
     assert np.array_equal(problem.generalized.jac.toarray(), h.T)
@@ -145,7 +150,8 @@ def test_load_of_fclib_sums_repeated_triplets(tmp_path):
 
 
 def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
-    m, h = np.diag([2.0, 4.0, 0.5]), W.T
+    m = np.diag([2.0, 4.0, 0.5])
+    h = W.T
     m[0, 1] = 1.0
     parts = {"M": encoded(m, -2), "H": encoded(h, -2)}
     problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(3.0), w=np.ones(3), mu=[0.5], **parts))
@@ -155,8 +161,12 @@ def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
 
 def test_load_of_fclib_equations_become_free_rows(tmp_path):
     """Local V, R, s and global G, b: the same mechanism, joined rigidly at one row."""
-    m, h, g = (np.diag([2.0, 4.0, 0.5, 1.0]), np.vstack([W, np.ones(3)]), np.array([[1.0], [0.0], [0.0], [-1.0]]))
-    f, w, b = np.arange(4.0), np.ones(3), np.array([0.25])
+    m = np.diag([2.0, 4.0, 0.5, 1.0])
+    h = np.vstack([W, np.ones(3)])
+    g = np.array([[1.0], [0.0], [0.0], [-1.0]])
+    f = np.arange(4.0)
+    w = np.ones(3)
+    b = np.array([0.25])
     glob = lavender.io.load(
         make(tmp_path / "g.h5", M=encoded(m, -2), H=encoded(h, -2), G=encoded(g, -2), f=f, w=w, b=b, mu=[0.5])
     )
@@ -188,9 +198,8 @@ def test_save_to_fclib_of_unsupported_data_names_it(tmp_path):
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
     single = np.eye(3, dtype=np.float32)
     moved = lv.Problem.from_jacobian(
-        single, single, single[0], cones=lv.Cones.contacts(0.5),
-        dof_names=["x", "y", "z"], name="\ud800",
-    )  # fmt: skip
+        single, single, single[0], cones=lv.Cones.contacts(0.5), dof_names=["x", "y", "z"], name="\ud800"
+    )
     heavy = lv.Problem.from_rows(touching([[-1, 0]], inv_mass=[0.0]), tangents=2)
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 bounded rows"]),
@@ -232,10 +241,11 @@ GOOD = encoded(W, -2)
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
         ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
         ({"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}}, "outside of the matrix"),
-        ({"mu": [-0.5]}, "mu"), ({"spacedim": 2}, "has 3 rows; a multiple of spacedim = 2"),
+        ({"mu": [-0.5]}, "mu"),
+        ({"spacedim": 2}, "has 3 rows; a multiple of spacedim = 2"),
         ({"spacedim": 5}, "2 or 3 is needed"),
     ],
-)  # fmt: skip
+)
 def test_load_of_an_inconsistent_fclib_file_names_the_entry(tmp_path, changes, sign):
     parts = {"W": GOOD, "q": np.zeros(3), "mu": [0.5]} | changes
     path = make(tmp_path / "bad.h5", **{n: v for n, v in parts.items() if v is not None})

@@ -48,10 +48,15 @@ def test_problem_has_the_engines_rows_and_law(model):
             np.testing.assert_allclose(problem.b, b, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("integrator", "is_compatible", "moved_by"), [
-    ("approximate_implicitfast", True, "acceleration"), ("Euler", False, "acceleration"),
-    ("Euler", True, "acceleration"), ("implicitfast", True, "forces"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("integrator", "is_compatible", "moved_by"),
+    [
+        ("approximate_implicitfast", True, "acceleration"),
+        ("Euler", False, "acceleration"),
+        ("Euler", True, "acceleration"),
+        ("implicitfast", True, "forces"),
+    ],
+)
 def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_integrator(
     integrator, is_compatible, moved_by
 ):
@@ -68,7 +73,8 @@ def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_int
     solver.dyn_info = SimpleNamespace(dofs=SimpleNamespace(damping=Recorded(np.zeros(3))))
     acc, vel, smooth = (array_of(scene, f"dyn_state.dofs.{name}") for name in ("acc", "vel", "acc_smooth"))
     solver.dyn_state.dofs.acc = Recorded(0.5 * acc)
-    step, dt = lv.io.from_genesis(scene), solver.substep_dt
+    step = lv.io.from_genesis(scene)
+    dt = solver.substep_dt
     for i in range(len(step.batch)):
         expected = vel[:, i] - 0.5 * dt * acc[:, i] + dt * smooth[:, i]
         np.testing.assert_allclose(step.batch[i].generalized.v_free, expected, rtol=1e-5, atol=1e-6)

@@ -40,7 +40,8 @@ def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
         matrix, b, lam, counts = engine_world(solver, i)
         if not np.isfinite(b).all() or not len(b):
             continue
-        problem, order = step.batch[i], normals_first(*counts)
+        problem = step.batch[i]
+        order = normals_first(*counts)
         # float32 roundings of sums of up to 24 terms
         assert np.abs(problem.dense() - matrix[np.ix_(order, order)]).max() <= 1e-6 * np.abs(matrix).max()
         assert np.abs(problem.b - b[order]).max() <= 1e-6 * (np.abs(b).max() + 1.0)
@@ -69,7 +70,8 @@ def test_from_kamino_verdicts_agree_with_complementarity_by_numpy(model):
     judged = lv.residual_many(step.batch, step.impulse).velocity_error
     for i in range(len(step.batch)):
         matrix, b, lam, (joints, bounded, limits, contacts) = engine_world(solver, i)
-        w, d = matrix @ lam - b, np.diag(matrix)
+        w = matrix @ lam - b
+        d = np.diag(matrix)
         mu = step.batch[i].cones.mu[step.batch[i].cones.is_contact]
         worst = np.abs(w[:joints]).max(initial=0.0)
         for k in range(contacts):
@@ -94,7 +96,8 @@ def test_from_kamino_immovable_bodies_keep_their_velocity():
     engine = solver._solver_kamino
     problem, jacobians = engine.problem_fd.data, engine._jacobians.data
     for i, m in enumerate(problem.dim.numpy()):  # The engine's D, had it known that these bodies cannot move.
-        m, nv = int(m), 12
+        m = int(m)
+        nv = 12
         jac = jacobians.J_cts_data.numpy()[jacobians.J_cts_offsets.numpy()[i] :][: m * nv].reshape(m, nv)
         inv_mass = np.zeros((nv, nv))
         inv_mass[:3, :3] = np.eye(3) * engine._model.bodies.inv_m_i.numpy()[2 * i]
@@ -111,10 +114,10 @@ def test_from_kamino_immovable_bodies_keep_their_velocity():
     assert np.abs(pushed[:6] - free[:6]).max() > 0.1
 
 
-@pytest.mark.parametrize("config", [
-    {}, {"sparse_jacobian": True}, {"dynamics_solver": "dvi"},
-    {"dynamics_solver": "dvi", "sparse_jacobian": False},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [{}, {"sparse_jacobian": True}, {"dynamics_solver": "dvi"}, {"dynamics_solver": "dvi", "sparse_jacobian": False}],
+)
 def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_compliance(config, monkeypatch):
     pytest.importorskip("newton")
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "findings" / "probes")

@@ -37,7 +37,8 @@ def test_from_mujoco_answer_of_newton_is_a_solution(cone, condim, jacobian):
 def test_from_mujoco_matrix_and_b_equal_the_arrays_of_mujoco():
     model, data = state(jacobian="sparse")
     problem = lv.io.from_mujoco(model, data)
-    jac, mass = adapter.jacobian(model, data).toarray(), np.zeros((model.nv, model.nv))
+    jac = adapter.jacobian(model, data).toarray()
+    mass = np.zeros((model.nv, model.nv))
     for i, column in enumerate(np.eye(model.nv)):
         mj.mj_mulM(model, data, mass[i], column)
     a = jac @ np.linalg.solve(mass, jac.T) + np.diag(data.efc_R)
@@ -102,7 +103,8 @@ def test_from_mujoco_has_velocities_keys_and_no_guess():
     assert lv.solve(problem, "newton", tol=1e-6).iterations > 0
     assert lv.solve(problem, "newton", tol=1e-6, impulse=adapter.impulse(model, data)).iterations == 0
     assert len(np.unique(problem.key)) == problem.n_blocks
-    names, keys = list(problem.names), problem.key
+    names = list(problem.names)
+    keys = problem.key
     mj.mj_step(model, data)
     mj.mj_forward(model, data)
     later = lv.io.from_mujoco(model, data)
@@ -209,7 +211,8 @@ def test_solve_of_a_flex_gives_the_acceleration_of_mujoco(cone, condim, kind):
         model = mj.MjModel.from_xml_string(CLOTH.format(cone=cone, condim=condim, more=more, edge=edge))
     except ValueError as error:
         pytest.skip(f"this MuJoCo does not know it: {error}")
-    data, met = mj.MjData(model), 0
+    data = mj.MjData(model)
+    met = 0
     for _ in range(12):
         try:
             mj.mj_step(model, data, 10)
@@ -273,7 +276,9 @@ def test_from_mujoco_with_a_changed_array_raises_or_reads_the_same_problem(name,
     mj.mj_forward(model, data)
     right = lv.io.from_mujoco(model, data)
     array = getattr(model if name.startswith("M_") else data.contact if name == "dim" else data, name)
-    before, n, said = np.array(array), len(array), []
+    before = np.array(array)
+    n = len(array)
+    said = []
     wrong = (-1, 2**31 - 1, 1000) if name in INDICES else (np.nan, np.inf)
     # Of one entry of J that nothing moves or pushes nobody can tell: all at once are a little more.
     scaled = () if name in INDICES else [(slice(None), (1.0 + 1e-6) * before)]
@@ -295,7 +300,8 @@ def test_from_mujoco_keeps_only_constant_arrays_of_a_model_and_releases_it():
     for name in ("body_parentid", "dof_bodyid"):
         lv.io.from_mujoco(model, data)
         whole = getattr(model, name)
-        kept, whole[-1] = int(whole[-1]), 1000
+        kept = int(whole[-1])
+        whole[-1] = 1000
         with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid do not describe a tree"):
             lv.io.from_mujoco(model, data)
         whole[-1] = kept

@@ -56,7 +56,8 @@ MODELS = {
 def make_states(text, steps=120, every=6):
     """Return the model and the states before steps with constraint rows, under random controls."""
     model = mj.MjModel.from_xml_string(text)
-    data, rng = mj.MjData(model), np.random.default_rng(0)
+    data = mj.MjData(model)
+    rng = np.random.default_rng(0)
     states = []
     for k in range(steps):
         data.ctrl[:] = 0.2 * rng.normal(size=model.nu)
@@ -80,7 +81,8 @@ def test_from_mujoco_of_a_discrete_step_has_the_matrix_that_mujoco_responds_with
     # The matrix is measured from outside: a unit force changes qacc_smooth by a column of its inverse.
     model, states = make_states(MODELS[name])
     data = forward(model, states[-1])
-    problem, smooth = lv.io.from_mujoco(model, data), data.qacc_smooth.copy()
+    problem = lv.io.from_mujoco(model, data)
+    smooth = data.qacc_smooth.copy()
     columns = np.empty((model.nv, model.nv))
     for i in range(model.nv):
         data.qfrc_applied[:] = 0.0
@@ -126,7 +128,8 @@ def test_from_mujoco_many_of_discrete_steps_equals_from_mujoco(name):
     model, states = make_states(MODELS[name])
     imported = lv.io.from_mujoco_many(model, states, threads=2)
     for i, state in enumerate(states):
-        problem, world = lv.io.from_mujoco(model, forward(model, state)), imported.batch[i]
+        problem = lv.io.from_mujoco(model, forward(model, state))
+        world = imported.batch[i]
         mass = problem.generalized.mass.toarray()
         assert world.generalized.mass.toarray() == pytest.approx(mass, abs=1e-14 * np.abs(mass).max())
         assert world.b == pytest.approx(problem.b, abs=1e-12 * np.abs(problem.b).max())

@@ -40,15 +40,22 @@ def variants():
     yield "rows in float32", lv.Problem.from_rows(lv.Rows(**single), mu=0.5)
     yield "csr", lv.Problem.linear(a, np.linspace(-1.0, 1.0, 9))
     yield "csr, contacts", lv.Problem.contact(a, np.ones(9), [0.0, 0.5, 1e60], name="contacts")
-    jac, mass = np.arange(12.0).reshape(3, 4), np.diag([1.0, 2.0, 3.0, 4.0])
+    jac = np.arange(12.0).reshape(3, 4)
+    mass = np.diag([1.0, 2.0, 3.0, 4.0])
     mass[-1, :-1] = mass[:-1, -1] = 0.5  # fills in as it is given: kept in another order
     yield (
         "J and M, everything",
         lv.Problem.from_jacobian(
-            jac, mass, np.ones(4), cones=lv.Cones.contacts(0.3), friction="cone", compliance=0.1, names=["foot"],
+            jac,
+            mass,
+            np.ones(4),
+            cones=lv.Cones.contacts(0.3),
+            friction="cone",
+            compliance=0.1,
+            names=["foot"],
             dof_names=["hip", "knee", "ankle", "toe"],
         ),
-    )  # fmt: skip
+    )
     for rows in (
         {},
         {"A": [[1.0, 1.0]], "b": [1.0]},
@@ -153,10 +160,15 @@ def test_load_of_an_npz_unpickles_nothing(tmp_path, monkeypatch):
 
 
 PROGRAM = {
-    "P": np.array([[2.0, 0.5], [0.5, 1.0]]), "q": np.array([1.0, -3.0]), "A": np.array([[1.0, 2.0]]),
-    "b": np.array([-2.1]), "G": np.array([[1.0, -1.0], [0.3, 1.0], [0.0, 1.0]]), "h": np.array([1.0, np.inf, 0.7]),
-    "lb": np.array([-np.inf, -1.0]), "ub": np.array([5.0, -1.0]),
-}  # fmt: skip
+    "P": np.array([[2.0, 0.5], [0.5, 1.0]]),
+    "q": np.array([1.0, -3.0]),
+    "A": np.array([[1.0, 2.0]]),
+    "b": np.array([-2.1]),
+    "G": np.array([[1.0, -1.0], [0.3, 1.0], [0.0, 1.0]]),
+    "h": np.array([1.0, np.inf, 0.7]),
+    "lb": np.array([-np.inf, -1.0]),
+    "ub": np.array([5.0, -1.0]),
+}
 
 
 def compressed(arrays, keys="PGA"):
@@ -251,16 +263,23 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
     ("changes", "sign"),
     [
         ({"lavender_format": np.int64(2)}, "this lavender reads 1"),
-        ({"lavender_format": np.array([1, 1])}, "this lavender reads 1"), ({"A": None}, "no entry 'A_shape'"),
+        ({"lavender_format": np.array([1, 1])}, "this lavender reads 1"),
+        ({"A": None}, "no entry 'A_shape'"),
         ({"cones_mu": None}, "no entry 'cones_mu'"),
         *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)),
         ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no names"),
-        *(({"meta": META | change}, words) for change, words in (
-            ({"operator": "magic"}, "operator 'magic'"), ({"names": "abc"}, "names of blocks is 'abc'"),
-            ({"friction": "glue"}, "'coulomb' or 'cone'"),
-            ({"names": ["one"]}, "entries for 12 blocks"), ({"precision": "float16"}, "precision"))),
+        *(
+            ({"meta": META | change}, words)
+            for change, words in (
+                ({"operator": "magic"}, "operator 'magic'"),
+                ({"names": "abc"}, "names of blocks is 'abc'"),
+                ({"friction": "glue"}, "'coulomb' or 'cone'"),
+                ({"names": ["one"]}, "entries for 12 blocks"),
+                ({"precision": "float16"}, "precision"),
+            )
+        ),
     ],
-)  # fmt: skip
+)
 def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes, sign):
     changes = {
         k: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for k, v in changes.items()
@@ -272,7 +291,8 @@ def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
 def test_save_over_a_file_keeps_its_permissions(tmp_path, mode):
-    problem, path = lv.Problem.lcp([[2.0]], [1.0]), tmp_path / "a.npz"
+    problem = lv.Problem.lcp([[2.0]], [1.0])
+    path = tmp_path / "a.npz"
     problem.save(path)
     path.chmod(mode)
     problem.save(path)

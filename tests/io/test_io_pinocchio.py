@@ -28,8 +28,11 @@ def robot(seed=0):
     tip = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.0]))
     anchor = pin.PointAnchorConstraintModel(model, 0, pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.1])), arm, tip)
     models = [
-        anchor, contact, pin.JointLimitConstraintModel(model, [arm]), pin.JointFrictionConstraintModel(model, [arm]),
-    ]  # fmt: skip
+        anchor,
+        contact,
+        pin.JointLimitConstraintModel(model, [arm]),
+        pin.JointFrictionConstraintModel(model, [arm]),
+    ]
     set_time_step(models, 0.01)
     return model, models, q, 0.3 * rng.normal(size=model.nv)
 
@@ -57,7 +60,8 @@ def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
     data = model.createData()
     np.testing.assert_allclose(problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12)
     # J by differences of the two points' places, which Pinocchio's forward kinematics moves.
-    h, jac = 1e-6, problem.jacobian.toarray()
+    h = 1e-6
+    jac = problem.jacobian.toarray()
     base, arm = 1, 2
 
     def places(q):
@@ -67,7 +71,8 @@ def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
     for k in range(model.nv):
         step = np.zeros(model.nv)
         step[k] = h
-        ahead, behind = places(pin.integrate(model, q, step)), places(pin.integrate(model, q, -step))
+        ahead = places(pin.integrate(model, q, step))
+        behind = places(pin.integrate(model, q, -step))
         corner, tip = ((x - y) / (2.0 * h) for x, y in zip(ahead, behind, strict=True))
         np.testing.assert_allclose(jac[3:6, k], corner[[2, 0, 1]], atol=1e-8)  # 1e-6 squared, and rounding over it
         np.testing.assert_allclose(jac[0:3, k], tip, atol=1e-8)
@@ -123,9 +128,7 @@ def test_from_pinocchio_rows_of_joints_and_anchors_have_the_unit_of_their_veloci
     assert "".join(problem.row_unit(i)[0] for i in range(problem.m)) == units + "mmmrrr"
 
 
-KINDS = (
-    "RX", "PZ", "RUBX", "Spherical", "SphericalZYX", "Planar", "Translation", "FreeFlyer", "RevoluteUnaligned",
-)  # fmt: skip
+KINDS = ("RX", "PZ", "RUBX", "Spherical", "SphericalZYX", "Planar", "Translation", "FreeFlyer", "RevoluteUnaligned")
 
 
 def vectors(joint):
@@ -148,12 +151,15 @@ def test_from_pinocchio_limits_and_friction_hold_in_its_own_dynamics(seed):
     model.upperPositionLimit = model.lowerPositionLimit + rng.uniform(0.0, 0.5, model.nq)
     model.upperDryFrictionLimit = rng.uniform(0.0, 2.0, model.nv)
     model.lowerDryFrictionLimit = -rng.uniform(0.0, 2.0, model.nv)
-    v, tau, dt = rng.normal(size=model.nv), rng.normal(size=model.nv), 0.01
+    v = rng.normal(size=model.nv)
+    tau = rng.normal(size=model.nv)
+    dt = 0.01
     joints = list(range(1, model.njoints))
     models = [pin.JointLimitConstraintModel(model, joints), pin.JointFrictionConstraintModel(model, joints)]
     problem = problem_of(model, models, q, v, dt, tau=tau, correction=1.0)
     solution = lv.solve(problem, tol=1e-10, max_iter=20_000).raise_for_status()
-    own, first = solution.impulse, problem.m - model.nv
+    own = solution.impulse
+    first = problem.m - model.nv
     # Pinocchio's velocity under these efforts, and what each joint does then.
     effort = tau + problem.jacobian.T @ own / dt
     after = v + dt * pin.aba(model, model.createData(), q, v, effort)
@@ -184,13 +190,16 @@ def test_from_pinocchio_desired_velocity_is_the_target(kind):
 
 def anchored_chain(kind):
     """A chain of four hinges with its tip anchored, a velocity that keeps the anchor, and (dJ/dt) v by kinematics."""
-    model, parent = pin.Model(), 0
+    model = pin.Model()
+    parent = 0
     for i in range(4):
         place = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5 * (i > 0)]))
         parent = model.addJoint(parent, pin.JointModelRY(), place, f"hinge {i}")
         inertia = pin.Inertia(1.0 + i, np.array([0.0, 0.0, -0.25]), np.diag([0.02, 0.02, 0.01]))
         model.appendBodyToJoint(parent, inertia, pin.SE3.Identity())
-    tip, data, rng = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5])), model.createData(), np.random.default_rng(1)
+    tip = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5]))
+    data = model.createData()
+    rng = np.random.default_rng(1)
     q = rng.normal(size=4)
     pin.forwardKinematics(model, data, q)
     anchor = getattr(pin, f"{kind}AnchorConstraintModel")(model, 0, data.oMi[parent] * tip, parent, tip)
@@ -212,7 +221,8 @@ def test_from_pinocchio_acceleration_level_gives_the_constrained_acceleration(ki
     model, anchor, q, v, jac, drift = anchored_chain(kind)
     data = model.createData()
     upper = np.triu(pin.crba(model, data, q))
-    mass, force = upper + np.triu(upper, 1).T, -pin.nle(model, data, q, v)
+    mass = upper + np.triu(upper, 1).T
+    force = -pin.nle(model, data, q, v)
     kkt = np.block([[mass, jac.T], [jac, np.zeros((len(jac), len(jac)))]])
     exact = np.linalg.solve(kkt, np.concatenate([force, -drift]))[:4]
 

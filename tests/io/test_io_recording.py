@@ -146,8 +146,9 @@ def test_record_with_controls_plays_draws_or_calls_them(tmp_path):
     calls = [lambda *_, given=given: given for given in ([np.nan], [1.0, 2.0], "fast")]
     for given, words in (
         *(({"control": wrong}, "control") for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls)),
-        ({"control": "random", "seed": -1}, "seed is -1"), ({"replace": "no"}, "replace is 'no'"),
+        ({"control": "random", "seed": -1}, "seed is -1"),
+        ({"replace": "no"}, "replace is 'no'"),
         ({"steps": 0}, "steps is 0"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(lv.InputError, match=words):
             lv.io.record(model, data, tmp_path, **{"steps": 1} | given)

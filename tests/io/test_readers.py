@@ -29,7 +29,8 @@ def read_genesis(model, **changes):
 
 def read_newton_mujoco(cone, **changes):
     solver = make_newton_mujoco(cone, **changes)
-    data, dt = solver.mjw_data, solver.mj_model.opt.timestep
+    data = solver.mjw_data
+    dt = solver.mj_model.opt.timestep
     step = lv.io.from_newton_mujoco(solver, data.qvel.array)
     return step, data.qvel.array + dt * data.qacc.array
 
@@ -66,11 +67,13 @@ def test_reader_impulses_give_the_next_velocity_of_the_engine(name):
     ("name", "world", "changes"),
     [
         ("kamino, stacks", 7, {}),  # recorded with a NaN
-        ("genesis, arm", 1, {"vel": spoil(1, np.nan)}), ("genesis, convex", 1, {"qacc": spoil(1, np.nan)}),
-        ("genesis, convex", 1, {"qacc": spoil(1, 1e12)}), ("newton's mujoco, elliptic", 1, {"qacc": spoil(1, np.nan)}),
+        ("genesis, arm", 1, {"vel": spoil(1, np.nan)}),
+        ("genesis, convex", 1, {"qacc": spoil(1, np.nan)}),
+        ("genesis, convex", 1, {"qacc": spoil(1, 1e12)}),
+        ("newton's mujoco, elliptic", 1, {"qacc": spoil(1, np.nan)}),
         ("newton's mujoco, elliptic", 1, {"qacc": spoil(1, -1e12)}),
     ],
-)  # fmt: skip
+)
 def test_reader_of_a_world_with_bad_numbers_has_no_answer_for_it_alone(name, world, changes):
     step, _ = READERS_BY_ENGINE[name](**changes)
     found = lv.residual_many(step.batch, step.impulse, errors="status")
@@ -93,8 +96,10 @@ def test_from_newton_mujoco_counts_used_iterations_and_rows_and_contacts_without
     solver = make_newton_mujoco("pyramidal")
     data = solver.mjw_data
     data.solver_niter = Recorded([2, 100, 3])
-    needed, stored = data.nefc.array + MAX_ROWS, int(data.nacon.array[0])
-    data.nefc, data.nacon = Recorded(needed), Recorded([stored + 5])
+    needed = data.nefc.array + MAX_ROWS
+    stored = int(data.nacon.array[0])
+    data.nefc = Recorded(needed)
+    data.nacon = Recorded([stored + 5])
     step = lv.io.from_newton_mujoco(solver, data.qvel.array)
     assert step.claims.converged.tolist() == [True, False, True]
     assert (step.batch.row_counts == MAX_ROWS).all()
@@ -119,8 +124,9 @@ def flatten_inertia(x):
     return x
 
 
-KAMINO, GENESIS, MUJOCO = (lv.io.from_kamino, make_kamino, "mixed"), (lv.io.from_genesis, make_genesis, "arm"), (
-    lambda solver: lv.io.from_newton_mujoco(solver, np.zeros((3, 1))), make_newton_mujoco, "elliptic")  # fmt: skip
+KAMINO = (lv.io.from_kamino, make_kamino, "mixed")
+GENESIS = (lv.io.from_genesis, make_genesis, "arm")
+MUJOCO = (lambda solver: lv.io.from_newton_mujoco(solver, np.zeros((3, 1))), make_newton_mujoco, "elliptic")
 #: Reader, changes of arrays, change of the object, words of the CapabilityError.
 UNSUPPORTED = [
     (KAMINO, {"inv_m_i": lambda x: 1.01 * x}, None, r"world \d: the engine's matrix differs"),

@@ -37,14 +37,16 @@ def compute_exact_acceleration(model, data):
     """Return the minimiser of MuJoCo's cost for one velocity and one-sided rows, by bisection in exact fractions."""
     jac = [Fraction(float(x)) for x in adapter.jacobian(model, data).toarray().ravel()]
     weight = [1 / Fraction(float(r)) for r in data.efc_R]
-    aref, smooth = [Fraction(float(x)) for x in data.efc_aref], Fraction(float(data.qacc_smooth[0]))
+    aref = [Fraction(float(x)) for x in data.efc_aref]
+    smooth = Fraction(float(data.qacc_smooth[0]))
     mass = Fraction(float(data.M[0]))
 
     def slope(a):
         rows = zip(jac, weight, aref, strict=True)
         return mass * (a - smooth) + sum(j * w * min(0, j * a - r) for j, w, r in rows)
 
-    low, high = Fraction(-(10**6)), Fraction(10**6)
+    low = Fraction(-(10**6))
+    high = Fraction(10**6)
     for _ in range(100):  # To 2e6 / 2^100 rad/s^2.
         middle = (low + high) / 2
         low, high = (middle, high) if slope(middle) < 0 else (low, middle)
@@ -57,7 +59,8 @@ def test_residual_of_exact_acceleration_without_digits_in_forces_is_at_floor(con
     for model, data in iterate_pressed_states(condim):
         exact = compute_exact_acceleration(model, data)
         assert abs(data.qacc[0] - exact) * model.opt.timestep < 1e-13  # rad/s
-        problem, impulse = lv.io.from_mujoco(model, data), adapter.impulse(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        impulse = adapter.impulse(model, data)
         found = lv.residual(problem, impulse)
         assert found.verdict in ("at its floor", "close enough")
         assert found.at_floor == found.rounds
@@ -103,10 +106,15 @@ def test_from_efc_with_acceleration_judges_the_acceleration(dtype):
     for model, data in iterate_pressed_states(3):
         mass = np.array([[data.M[0]]])
         arrays = {
-            "efc_J": adapter.jacobian(model, data).toarray(), "efc_D": data.efc_D, "efc_aref": data.efc_aref,
-            "M": mass, "qvel": data.qvel, "qacc_smooth": data.qacc_smooth, "qacc": data.qacc,
+            "efc_J": adapter.jacobian(model, data).toarray(),
+            "efc_D": data.efc_D,
+            "efc_aref": data.efc_aref,
+            "M": mass,
+            "qvel": data.qvel,
+            "qacc_smooth": data.qacc_smooth,
+            "qacc": data.qacc,
             "efc_force": data.efc_force,
-        }  # fmt: skip
+        }
         stacked = {name: np.asarray(x)[None].astype(dtype) for name, x in arrays.items()}
         imported = lv.io.from_efc(
             **stacked, efc_type=data.efc_type[None], timestep=model.opt.timestep, nefc=[data.nefc]

@@ -28,9 +28,11 @@ def test_reconstruct_is_the_projection_of_the_motion_on_the_cone():
     problem = lv.Problem.from_jacobian(np.eye(2), 2.0 * np.eye(2), [-1.0, 3.0], cones=cones, compliance=1.0)
     ray = np.array([1.0, -0.5]) / np.hypot(1.0, 0.5)  # Boundary of the cone against the sliding.
     for after, impulse in (
-        ([0.0, 2.9], [2.0, -0.2]), ([1.0, 3.0], [4.0, 0.0]), ([-1.0, 0.0], ray * (ray @ [0.0, -6.0])),
+        ([0.0, 2.9], [2.0, -0.2]),
+        ([1.0, 3.0], [4.0, 0.0]),
+        ([-1.0, 0.0], ray * (ray @ [0.0, -6.0])),
         ([-2.0, 3.0], [0.0, 0.0]),
-    ):  # fmt: skip
+    ):
         found = lv.io.reconstruct(problem, after)
         np.testing.assert_allclose(found.impulse, impulse, atol=1e-8)
         left = np.array(after) - [-1.0, 3.0] - np.array(impulse) / 2.0

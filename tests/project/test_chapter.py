@@ -42,7 +42,8 @@ def value(text):
 
 def claims(text):
     """Command -> [(numbers as they stand, tolerance [%] or "", printed line)], and the set of other numbers."""
-    by, others = {}, set()
+    by = {}
+    others = set()
     for comment in COMMENT.findall(text):
         first, *lines = comment.strip().splitlines()
         kind, colon, listed = first.partition(": ")
@@ -63,7 +64,8 @@ def printed(command):
         return Path(folder, command.replace("/", "_")).read_text(encoding="utf-8")
     words = shlex.split(command)
     if words[0] == "python":
-        name, out = Path(words[1]).stem, io.StringIO()
+        name = Path(words[1]).stem
+        out = io.StringIO()
         with TemporaryDirectory() as folder, contextlib.redirect_stdout(out):
             figure = Path(folder, f"{name}.png")  # the script's own name: all numbers and all panels
             example(name).main(str(figure))

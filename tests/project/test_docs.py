@@ -181,8 +181,11 @@ def anchors(page):
 
 
 LINKED = [
-    *PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / ".github").glob("*.md")), *sorted((ROOT / "examples").rglob("*.md")),
-]  # fmt: skip
+    *PAGES,
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / ".github").glob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
+]
 
 
 def links(page):
@@ -274,9 +277,11 @@ def test_readme_has_the_numbers_of_its_figure():
     newton = next(seconds for seconds, error in curves["newton"] if error <= reached[1])
     before, after = numbers["worst"].values()
     for part in (
-        f"a pile of {numbers['rows']} rows", "`pgs` and `nncg` stop above 0.1 mm/s",
+        f"a pile of {numbers['rows']} rows",
+        "`pgs` and `nncg` stop above 0.1 mm/s",
         f"`auto` reaches {reached[1]:.0e} m/s in {1e3 * reached[0]:.0f} ms".replace("e-0", "e-"),
-        f"needs {1e3 * newton:.0f} ms", f"all {numbers['steps']} steps",
+        f"needs {1e3 * newton:.0f} ms",
+        f"all {numbers['steps']} steps",
         f"from {before:.1e} to {after:.1e} m/s".replace("e-0", "e-"),
-    ):  # fmt: skip
+    ):
         assert part in text, part

@@ -10,7 +10,8 @@ def run(*arguments, seed="0", status=0):
 
 
 def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path):
-    file, only = tmp_path / "then.txt", ("--only", "box_stackF(n=10)")
+    file = tmp_path / "then.txt"
+    only = ("--only", "box_stackF(n=10)")
     run(*only, "--out", file)
     before = file.read_text()
     items = [line.split("\t")[1] for line in before.splitlines()]
@@ -20,7 +21,8 @@ def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path)
     run("--only", "two_particles | pgs", "--out", file)  # Only these items of the file are written.
     assert set(before.splitlines()) < set(file.read_text().splitlines())
     run(*only, "--out", file)
-    lines, named = before.splitlines(keepends=True), []
+    lines = before.splitlines(keepends=True)
+    named = []
     for word in ("| pgs | random", "| newton"):  # the second goes through LAPACK
         at = next(i for i, line in enumerate(lines) if word in line)
         kind, item, result, *rest = lines[at].split("\t")

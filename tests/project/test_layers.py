@@ -16,9 +16,15 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = ROOT / "lavender_ext"
 #: Packages of lavender_ext, bottom to top, whose modules share inline headers by cimport.
 LEVELS = (
-    {"core"}, {"factor", "judge", "local"}, {"derivative", "io", "sweep", "velocity_newton"}, {"newton", "pivot"},
-    {"accelerate", "engine"}, {"driver"}, {"small"}, {"batch"},
-)  # fmt: skip
+    {"core"},
+    {"factor", "judge", "local"},
+    {"derivative", "io", "sweep", "velocity_newton"},
+    {"newton", "pivot"},
+    {"accelerate", "engine"},
+    {"driver"},
+    {"small"},
+    {"batch"},
+)
 HEIGHT = {name: height for height, level in enumerate(LEVELS) for name in level}
 IMPORT = re.compile(r"^\s*(?:from|c?import)\s+(lavender\w*)([.\w]*)", re.MULTILINE)
 

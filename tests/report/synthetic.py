@@ -13,19 +13,37 @@ from lavender.report.timing import add_times
 
 TOLERANCES = (1e-3, 1e-6)
 FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}
-BUDGET = {"mode": "budget", "tol": 0.0, "max_iter": 8, "status": "MAX_ITERATIONS", "claims": False,
-          "work": '{"sweeps": 8}', "iterations": 8}  # fmt: skip
+BUDGET = {
+    "mode": "budget",
+    "tol": 0.0,
+    "max_iter": 8,
+    "status": "MAX_ITERATIONS",
+    "claims": False,
+    "work": '{"sweeps": 8}',
+    "iterations": 8,
+}
 EVIL = '</script><script>alert("x")</script>&|'
 
 
 def record(case, solver, time, relative, **more):
     """The row of a run of three repetitions, the smallest of which took `time`."""
     values = {
-        "kind": "run", "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "tol": 1e-6,
-        "time_limit": 2.0, "relative": relative, "error_energy": relative, "velocity": relative,
-        "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True,
-        "success": relative <= more.get("tol", 1e-6), "calibration_time": 1e-4,
-    }  # fmt: skip
+        "kind": "run",
+        "run": "run",
+        "case": case,
+        "sha": "sha" + case,
+        "solver": solver,
+        "tol": 1e-6,
+        "time_limit": 2.0,
+        "relative": relative,
+        "error_energy": relative,
+        "velocity": relative,
+        "roundoff_floor": 1e-15,
+        "status": "CONVERGED",
+        "claims": True,
+        "success": relative <= more.get("tol", 1e-6),
+        "calibration_time": 1e-4,
+    }
     times = more.pop("times", (1.02 * time, time, 1.04 * time))
     return add_times(RUN_COLUMNS | values | more, times)
 
@@ -42,16 +60,36 @@ def lines_of(*made, cases=None, whole=True, solvers=None, walk=False, more=()):
     """
     plan = {"tolerances": list(TOLERANCES), "solvers": solvers or sorted({r["solver"] for r in made})}
     machine = {
-        "kind": "machine", "run": "run", "started": "2026-01-01", "lavender": "0.1", "python": "3.11",
-        "platform": "linux", "cpu": "a cpu", "cores": 2, "threads": 1, "versions": {"numpy": "2"}, "plan": plan,
-        "build": {}, "load": None, "whole": whole,
-    }  # fmt: skip
+        "kind": "machine",
+        "run": "run",
+        "started": "2026-01-01",
+        "lavender": "0.1",
+        "python": "3.11",
+        "platform": "linux",
+        "cpu": "a cpu",
+        "cores": 2,
+        "threads": 1,
+        "versions": {"numpy": "2"},
+        "plan": plan,
+        "build": {},
+        "load": None,
+        "whole": whole,
+    }
     rows = [machine]
     for case in dict.fromkeys(r["case"] for r in made):
         facts = {
-            "kind": "case", "run": "run", "case": case, "source": case, "sha": "sha" + case, "law": "lcp", "rows": 8,
-            "blocks": 8, "structure": "stack", "mass_ratio": 1.0, "reason": "a reason",
-        }  # fmt: skip
+            "kind": "case",
+            "run": "run",
+            "case": case,
+            "source": case,
+            "sha": "sha" + case,
+            "law": "lcp",
+            "rows": 8,
+            "blocks": 8,
+            "structure": "stack",
+            "mass_ratio": 1.0,
+            "reason": "a reason",
+        }
         if walk and case.startswith("walk"):
             facts |= {"sequence": "walk", "step": int(case[5:-1])}
         rows.append(CASE_DETAILS | CASE_COLUMNS | facts | (cases or {}).get(case, {}))
@@ -91,13 +129,25 @@ def example(folder):
     facts = {
         "pile": {"source": str(folder / "pile.npz"), "stored": 1e-4, "diagnostics": ["duplicate rows: two of <3>"]},
         EVIL: {"source": "chains/one.npz", "guess": "answer", "structure": "stack, friction", "law": "coulomb"},
-        "idle": {"nothing_to_do": True}, **{f"walk[{k}]": {"structure": "chain"} for k in range(2)},
-    }  # fmt: skip
-    skips = [skip("torn", "", "did not load: torn: it is <empty>"), skip("pile", "sor", "takes laws linear"),
-             skip("walk 3", "", "did not load: of another problem", "walk")]  # fmt: skip
+        "idle": {"nothing_to_do": True},
+        **{f"walk[{k}]": {"structure": "chain"} for k in range(2)},
+    }
+    skips = [
+        skip("torn", "", "did not load: torn: it is <empty>"),
+        skip("pile", "sor", "takes laws linear"),
+        skip("walk 3", "", "did not load: of another problem", "walk"),
+    ]
     lines = lines_of(*made, cases=facts, walk=True, more=skips)
-    answer = {"file": "pile.npz", "rows": 8, "seconds": 5e-4, "relative": 1e-7, "solver": "NEWTON", "verdict": "wrong",
-              "velocity": 0.1, "worst": "contact 2"}  # fmt: skip
+    answer = {
+        "file": "pile.npz",
+        "rows": 8,
+        "seconds": 5e-4,
+        "relative": 1e-7,
+        "solver": "NEWTON",
+        "verdict": "wrong",
+        "velocity": 0.1,
+        "worst": "contact 2",
+    }
     (folder / "engine.jsonl").write_text(json.dumps(answer) + "\n" + json.dumps({"left_out": 1}) + "\n")
     old = lines_of(record("pile", "auto", 0.3e-3, 1e-9), record("pile", "pgs", 1.0, 1e-1))
     return Report(lines, old, [2e-4, 4e-3], read_engine_answers([], lines))

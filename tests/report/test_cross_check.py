@@ -119,9 +119,7 @@ def test_cross_check_with_a_refused_solver_lists_it_and_is_ok():
 # is 7 % off.
 KNOWN_LIARS = {"proxqp"}
 # Iterations may end at their default budget; direct methods, admm and anderson solve every case, with two exceptions.
-UNSOLVED = {
-    ("anderson", "boxed_friction(n=3, scene=granular)"), ("quadprog", "boxed_friction(n=3, scene=granular)")
-}  # fmt: skip
+UNSOLVED = {("anderson", "boxed_friction(n=3, scene=granular)"), ("quadprog", "boxed_friction(n=3, scene=granular)")}
 COMPARED = [
     c
     for c in [*suite.cases("default"), suite.case("granular(n=2, friction=cone)")]

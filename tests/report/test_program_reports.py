@@ -23,7 +23,8 @@ PLAN = report.Plan(tolerances=(1e-3, 1e-8), budgets=(), repeats=1, time_limit=60
 
 def control(n=5, dt=0.1, singular=False):
     """A program of predictive control: n steps of a double integrator with bounds on speed and force."""
-    step, force = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt * dt / 2.0], [dt]])
+    step = np.array([[1.0, dt], [0.0, 1.0]])
+    force = np.array([[dt * dt / 2.0], [dt]])
     weight = sp.block_diag([sp.kron(sp.eye(n), np.diag([10.0, 0.0 if singular else 1.0])), 0.1 * sp.eye(n)])
     A = sp.hstack([sp.kron(sp.eye(n, k=-1), step) - sp.eye(2 * n), sp.kron(sp.eye(n), force)])
     b = np.zeros(2 * n)
@@ -36,7 +37,8 @@ def control(n=5, dt=0.1, singular=False):
 def test_run_of_a_program_file_times_solve_qp_and_has_the_error_of_the_program(tmp_path, singular, monkeypatch):
     arrays = control(singular=singular)
     np.savez(tmp_path / "control.npz", **{k: x.toarray() if sp.issparse(x) else x for k, x in arrays.items()})
-    calls, real = [], case_kinds.solve_qp
+    calls = []
+    real = case_kinds.solve_qp
 
     def count(problem, solver, **arguments):
         calls.append(solver)
@@ -105,7 +107,8 @@ def test_bound_of_a_distance_holds_for_any_two_points(seed):
     """The distance is compared at points far from the solution, whose multipliers have the right signs."""
     rng = np.random.default_rng(seed)
     problem = lv.Problem.from_qp(**control(n=3, singular=seed % 2 == 1))
-    qp, case = problem.qp, make_case(problem)
+    qp = problem.qp
+    case = make_case(problem)
     best = lv.solve_qp(problem, "osqp", tol=1e-9)
     for size in (1e-6, 1e-2, 10.0):
         points = []

@@ -23,7 +23,13 @@ class Reader(html.parser.HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.loads, self.ids, self.wrong, self.alts, self.words, self.tags = [], [], [], [], [], [], set()
+        self.open = []
+        self.loads = []
+        self.ids = []
+        self.wrong = []
+        self.alts = []
+        self.words = []
+        self.tags = set()
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -53,7 +59,8 @@ class Reader(html.parser.HTMLParser):
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "steps"
     folder.mkdir()
-    report, events = example(folder), []
+    report = example(folder)
+    events = []
     write(report, folder / "out", watch=events.append)
     return report, folder / "out", events
 
@@ -73,11 +80,12 @@ def test_texts_of_a_report_with_every_part_are_approved(written):
     """The terminal, the summary and the words of the page outside of its tables, and the tables."""
     report, out, _ = written
     texts = {
-        "terminal": shown(report, 120, complete=True), "terminal, short": shown(report, 80),
+        "terminal": shown(report, 120, complete=True),
+        "terminal, short": shown(report, 80),
         "summary.md": (out / "summary.md").read_text(encoding="utf-8"),
         "words of the page": "\n".join(Reader((out / "index.html").read_text(encoding="utf-8")).words),
         **{path.name: path.read_text(encoding="utf-8") for path in sorted((out / "tables").iterdir())},
-    }  # fmt: skip
+    }
     for name, text in texts.items():
         check_text("report.txt", name, text.replace(str(out.parent), "FOLDER"))
 
@@ -130,7 +138,8 @@ def test_no_cell_of_a_report_says_nan_or_inf(tmp_path):
 
 @pytest.mark.parametrize(("cases", "width"), [(1, 60), (45, 80), (45, 10_000)])
 def test_terminal_short_report_of_any_size_has_the_answer_first_and_ten_solvers(cases, width):
-    made, names = [], [f"case {i} of a folder with a long name" for i in range(cases)]
+    made = []
+    names = [f"case {i} of a folder with a long name" for i in range(cases)]
     for name in names:
         for j in range(14):
             more = {**FALSE_CLAIM, "status_conflict": "says CONVERGED " * 9} if j > 5 else {"load": 9.0}
@@ -163,8 +172,10 @@ def test_profile_is_the_share_of_cases_within_a_factor_of_the_fastest():
 def test_page_of_forty_problems_and_twenty_solvers_is_within_150_kb(tmp_path):
     made = [
         record(f"problem {i}", f"solver_{j}", 1e-3 * (1 + j), 1e-8, tol=tol)
-        for i in range(20) for j in range(20) for tol in (1e-3, 1e-6)
-    ]  # fmt: skip
+        for i in range(20)
+        for j in range(20)
+        for tol in (1e-3, 1e-6)
+    ]
     write(report_of(*made), tmp_path)
     assert (tmp_path / "index.html").stat().st_size <= 150_000
 

@@ -36,8 +36,9 @@ def sweeps(*given):
     """Three steps swept n times: the first has no step before it, the second is harder than the third."""
     return [
         step_of(i, solver, 10.0 * v, **BUDGET | {"max_iter": n, "start": start, "velocity": v, "motion_error": 2.0 * v})
-        for start, n, solver, hardest in given for i, v in enumerate((1.0, hardest, 1e-5))
-    ]  # fmt: skip
+        for start, n, solver, hardest in given
+        for i, v in enumerate((1.0, hardest, 1e-5))
+    ]
 
 
 def carried():
@@ -53,96 +54,227 @@ SWEEPS = (
     ("carried", 4, "pgs", 1.1e-3),
 )
 NOISY = all_of("ab", ("direct", 1.0), ("auto", 1.07))
-CRASHED = [*all_of("ab", ("auto", 1e-3)), *all_of("ab", ("mine", 0.0), relative=math.inf, message="ValueError", **DEAD),
-           record("b", "yours", 0.0, math.inf, message="TypeError: of yours", **DEAD)]  # fmt: skip
+CRASHED = [
+    *all_of("ab", ("auto", 1e-3)),
+    *all_of("ab", ("mine", 0.0), relative=math.inf, message="ValueError", **DEAD),
+    record("b", "yours", 0.0, math.inf, message="TypeError: of yours", **DEAD),
+]
 STOPPED = [*(step_of(i, "auto", 1e-8) for i in range(4)), *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(4))]
 ENGINE = all_of("a", ("auto", 4e-5), ("pgs", 5e-4)) + all_of("b", ("auto", 8e-5), ("pgs", 1e-3))
 #: Name, runs, arguments of the report, and tables that are shown below the recommendation.
 SCENARIOS = [
-    ("a run to 1e-3 that reached 1e-7 counts for 1e-3 alone, and a budget for none", [
-        record("a", "pgs", 1e-5, 1e-7, tol=1e-3), record("a", "pgs", 3e-5, 1e-7),
-        record("a", "pgs", 1e-6, 1e-9, **BUDGET),
-    ], {}, "solvers"),
-    ("solved cases come before time, and false claims last", [
-        *all_of("ab", ("slow", 1e-2)), record("a", "fast", 1e-5, 1e-8), record("b", "fast", 1e-5, 1e-2),
-        record("a", "liar", 1e-6, 1e-8), record("b", "liar", 1e-6, 1e-8, **FALSE_CLAIM),
-    ], {}, "rank solvers runs"),
+    (
+        "a run to 1e-3 that reached 1e-7 counts for 1e-3 alone, and a budget for none",
+        [
+            record("a", "pgs", 1e-5, 1e-7, tol=1e-3),
+            record("a", "pgs", 3e-5, 1e-7),
+            record("a", "pgs", 1e-6, 1e-9, **BUDGET),
+        ],
+        {},
+        "solvers",
+    ),
+    (
+        "solved cases come before time, and false claims last",
+        [
+            *all_of("ab", ("slow", 1e-2)),
+            record("a", "fast", 1e-5, 1e-8),
+            record("b", "fast", 1e-5, 1e-2),
+            record("a", "liar", 1e-6, 1e-8),
+            record("b", "liar", 1e-6, 1e-8, **FALSE_CLAIM),
+        ],
+        {},
+        "rank solvers runs",
+    ),
     ("7 % within the noise of 8 % is a tie with auto first", repeated(NOISY, 1.0, 1.04, 1.08), {}, "rank"),
     ("7 % above the noise of 4 % is no tie", NOISY, {}, "rank"),
-    ("7 % within the noise of the slower solver alone is a tie", [
-        *all_of("ab", ("pgs", 1.0)), *repeated(all_of("ab", ("auto", 1.07)), 1.0, 1.04, 1.08)], {}, "rank"),
-    ("another solver of fewer cases changes no mean", [
-        record("a", "pgs", 1e-3, 1e-8), record("b", "pgs", 1e-2, 1e-8), record("a", "slow", 1.9, 1e-8),
-    ], {}, "rank"),
-    ("words of structures, laws and sequences are groups", all_of(("a", "b", "c", "walk[0]"), ("pgs", 1.0)), {
-        "walk": True, "cases": {"b": {"structure": "stack, redundant", "law": "coulomb"},
-                                "c": {"structure": "pile, friction", "law": "coulomb"}}}, "structures"),
-    ("two of three cases are solved by three solvers, of which two are equally fast", [
-        *all_of("ab", ("newton", 1.0), ("auto", 1.001), ("pgs", 3.0)), record("c", "pgs", 1.0, 0.5),
-    ], {}, "structures solvers"),
-    ("times are rows to the power 1.5; three cases are too few for a fit", [
-        *(record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in SIZES.items()), *all_of(list(SIZES)[:3], ("few", 1e-6)),
-    ], {"cases": {c: {"rows": n} for c, n in SIZES.items()}}, "costs"),
-    ("of 2 claims one is false, a run died, and a budget claims nothing", [
-        record("a", "pgs", 1.0, 1e-8), record("b", "pgs", 1.0, 0.5, **FALSE_CLAIM),
-        record("c", "pgs", 1.0, math.inf, status="KILLED", claims=False), record("c", "pgs", 1.0, 0.1, **BUDGET),
-    ], {}, "solvers"),
-    ("a miss at the floor, a proof and a budget are no failures", [
-        record("a", "good", 1.0, 1e-8), record("a", "floor", 1.0, 1e-5, roundoff_floor=1e-5),
-        record("a", "missed", 1.0, 1e-2, message="slow"), record("a", "liar", 1.0, 0.5, **FALSE_CLAIM),
-        record("a", "proved", 1.0, 1.0, status="INFEASIBLE"), record("a", "budget", 1.0, 0.5, **BUDGET),
-        record("a", "lucky liar", 1.0, 1e-9, **FALSE_CLAIM),
-    ], {}, "runs"),
+    (
+        "7 % within the noise of the slower solver alone is a tie",
+        [*all_of("ab", ("pgs", 1.0)), *repeated(all_of("ab", ("auto", 1.07)), 1.0, 1.04, 1.08)],
+        {},
+        "rank",
+    ),
+    (
+        "another solver of fewer cases changes no mean",
+        [record("a", "pgs", 1e-3, 1e-8), record("b", "pgs", 1e-2, 1e-8), record("a", "slow", 1.9, 1e-8)],
+        {},
+        "rank",
+    ),
+    (
+        "words of structures, laws and sequences are groups",
+        all_of(("a", "b", "c", "walk[0]"), ("pgs", 1.0)),
+        {
+            "walk": True,
+            "cases": {
+                "b": {"structure": "stack, redundant", "law": "coulomb"},
+                "c": {"structure": "pile, friction", "law": "coulomb"},
+            },
+        },
+        "structures",
+    ),
+    (
+        "two of three cases are solved by three solvers, of which two are equally fast",
+        [*all_of("ab", ("newton", 1.0), ("auto", 1.001), ("pgs", 3.0)), record("c", "pgs", 1.0, 0.5)],
+        {},
+        "structures solvers",
+    ),
+    (
+        "times are rows to the power 1.5; three cases are too few for a fit",
+        [*(record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in SIZES.items()), *all_of(list(SIZES)[:3], ("few", 1e-6))],
+        {"cases": {c: {"rows": n} for c, n in SIZES.items()}},
+        "costs",
+    ),
+    (
+        "of 2 claims one is false, a run died, and a budget claims nothing",
+        [
+            record("a", "pgs", 1.0, 1e-8),
+            record("b", "pgs", 1.0, 0.5, **FALSE_CLAIM),
+            record("c", "pgs", 1.0, math.inf, status="KILLED", claims=False),
+            record("c", "pgs", 1.0, 0.1, **BUDGET),
+        ],
+        {},
+        "solvers",
+    ),
+    (
+        "a miss at the floor, a proof and a budget are no failures",
+        [
+            record("a", "good", 1.0, 1e-8),
+            record("a", "floor", 1.0, 1e-5, roundoff_floor=1e-5),
+            record("a", "missed", 1.0, 1e-2, message="slow"),
+            record("a", "liar", 1.0, 0.5, **FALSE_CLAIM),
+            record("a", "proved", 1.0, 1.0, status="INFEASIBLE"),
+            record("a", "budget", 1.0, 0.5, **BUDGET),
+            record("a", "lucky liar", 1.0, 1e-9, **FALSE_CLAIM),
+        ],
+        {},
+        "runs",
+    ),
     ("the carried start halves the time", carried(), {"walk": True}, "sequences"),
-    ("8 carried or 16 cold sweeps keep 1 mm/s; acceleration is only in the table", [
-        *sweeps(*SWEEPS, ("carried", 2, "anderson", 1e-6)), sweeps(("carried", 2, "sequential_impulses", 1e-6))[1],
-    ], {"walk": True}, "sweeps"),
-    ("the engine's own 8 iterations leave 2.5 mm/s", sweeps(*SWEEPS), {"walk": True, "answers": {
-        "walk[1]": {"relative": 0.1, "velocity": 2.5e-3, "iterations": 8, "solver": "PGS"}}}, ""),
+    (
+        "8 carried or 16 cold sweeps keep 1 mm/s; acceleration is only in the table",
+        [*sweeps(*SWEEPS, ("carried", 2, "anderson", 1e-6)), sweeps(("carried", 2, "sequential_impulses", 1e-6))[1]],
+        {"walk": True},
+        "sweeps",
+    ),
+    (
+        "the engine's own 8 iterations leave 2.5 mm/s",
+        sweeps(*SWEEPS),
+        {"walk": True, "answers": {"walk[1]": {"relative": 0.1, "velocity": 2.5e-3, "iterations": 8, "solver": "PGS"}}},
+        "",
+    ),
     ("no measured number of sweeps keeps 1 mm/s", sweeps(SWEEPS[0], SWEEPS[3]), {"walk": True}, ""),
-    ("only accelerated sweeps keep 1 mm/s", sweeps(SWEEPS[0], SWEEPS[3], ("carried", 2, "anderson", 1e-6)),
-     {"walk": True}, ""),
-    ("a late run is a miss within 10 ms", [*all_of("ab", ("late", 1.0)), *all_of("ab", ("early", 1e-3), relative=1e-2)],
-     {"times": [1e-2]}, "structures"),
+    (
+        "only accelerated sweeps keep 1 mm/s",
+        sweeps(SWEEPS[0], SWEEPS[3], ("carried", 2, "anderson", 1e-6)),
+        {"walk": True},
+        "",
+    ),
+    (
+        "a late run is a miss within 10 ms",
+        [*all_of("ab", ("late", 1.0)), *all_of("ab", ("early", 1e-3), relative=1e-2)],
+        {"times": [1e-2]},
+        "structures",
+    ),
     ("no run ends within 10 ms", all_of("ab", ("late", 1.0)), {"times": [1e-2]}, "structures"),
-    ("two steps were not reached within the time of a pass, and one was missed", [
-        *(step_of(i, "pgs", 1e-8 if i < 3 else 0.25) for i in range(4)),
-        *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(6)), *(step_of(i, "pgs", 5e-4, tol=1e-3) for i in range(6)),
-    ], {"walk": True}, ""),
-    ("stopped in the first sequence, with two of three solvers unfinished", STOPPED,
-     {"walk": True, "whole": False, "solvers": ["auto", "pgs", "nncg"]}, "structures"),
-    ("stopped in a later sequence, with a case of which all solvers are measured", [
-        *all_of("a", ("auto", 1e-3), ("pgs", 1e-3), ("nncg", 1e-3)), *STOPPED,
-    ], {"walk": True, "whole": False}, "structures"),
-    ("stopped with two of three problems complete", [
-        *all_of("ab", ("auto", 1e-3), ("pgs", 1e-3)), *all_of("c", ("auto", 1e-3))], {"whole": False}, ""),
+    (
+        "two steps were not reached within the time of a pass, and one was missed",
+        [
+            *(step_of(i, "pgs", 1e-8 if i < 3 else 0.25) for i in range(4)),
+            *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(6)),
+            *(step_of(i, "pgs", 5e-4, tol=1e-3) for i in range(6)),
+        ],
+        {"walk": True},
+        "",
+    ),
+    (
+        "stopped in the first sequence, with two of three solvers unfinished",
+        STOPPED,
+        {"walk": True, "whole": False, "solvers": ["auto", "pgs", "nncg"]},
+        "structures",
+    ),
+    (
+        "stopped in a later sequence, with a case of which all solvers are measured",
+        [*all_of("a", ("auto", 1e-3), ("pgs", 1e-3), ("nncg", 1e-3)), *STOPPED],
+        {"walk": True, "whole": False},
+        "structures",
+    ),
+    (
+        "stopped with two of three problems complete",
+        [*all_of("ab", ("auto", 1e-3), ("pgs", 1e-3)), *all_of("c", ("auto", 1e-3))],
+        {"whole": False},
+        "",
+    ),
     ("stopped with no solution", [record("a", "auto", 1.0, 1.0)], {"whole": False}, ""),
-    ("stopped before any problem was complete", all_of("c", ("auto", 1e-3)),
-     {"whole": False, "solvers": ["auto", "pgs"]}, ""),
-    ("a miss, a tie and a call", [
-        *all_of("abc", ("auto", 1e-3), ("direct", 1.0001e-3)),
-        *all_of("d", ("auto", 1.0), ("direct", 1.0), relative=1e-2),
-    ], {}, ""),
-    ("one case takes a thousand times as long", [
-        record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))], {}, ""),
+    (
+        "stopped before any problem was complete",
+        all_of("c", ("auto", 1e-3)),
+        {"whole": False, "solvers": ["auto", "pgs"]},
+        "",
+    ),
+    (
+        "a miss, a tie and a call",
+        [
+            *all_of("abc", ("auto", 1e-3), ("direct", 1.0001e-3)),
+            *all_of("d", ("auto", 1.0), ("direct", 1.0), relative=1e-2),
+        ],
+        {},
+        "",
+    ),
+    (
+        "one case takes a thousand times as long",
+        [record(c, "pgs", t, 1e-8) for c, t in (("a", 1e-4), ("b", 1e-4), ("c", 1e-1))],
+        {},
+        "",
+    ),
     ("plug-ins have their place", all_of("a", ("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3)), {}, ""),
-    ("three solvers within 3 % and one at 20 %", all_of("a", ("pgs", 1e-3), ("auto", 1.03e-3), ("direct", 1.2e-3)), {},
-     "solvers rank matrix"),
+    (
+        "three solvers within 3 % and one at 20 %",
+        all_of("a", ("pgs", 1e-3), ("auto", 1.03e-3), ("direct", 1.2e-3)),
+        {},
+        "solvers rank matrix",
+    ),
     ("two crashed plug-ins", CRASHED, {"cases": {"b": {"law": "coulomb"}}}, "solvers"),
-    *((f"the engine's own answers are {words}", ENGINE, {"answers": {
-        case: {"solver": "NEWTON", "verdict": "wrong", "seconds": t, "relative": x}
-        for case, (t, x) in zip("ab", answers, strict=True)}}, "rank") for words, answers in (
-        ("faster", [(1e-5, 1e-9), (2e-5, 1e-9)]), ("slower", [(1e-4, 1e-9), (2e-4, 1e-9)]),
-        ("as fast", [(3.9e-5, 1e-9), (8e-5, 1e-9)]), ("right on one of two cases", [(1e-6, 1e-9), (1e-6, 1e-2)]),
-        ("wrong or without a residual", [(1e-6, 1e-2), (1e-6, math.nan)]))),
-    ("an engine that answered one of two problems is not ranked", ENGINE, {"answers": {
-        "a": {"solver": "NEWTON", "verdict": "wrong", "seconds": 1e-5, "relative": 1e-9}}}, "rank"),
-    *((f"compared with an earlier run, {words}", [record("a", "pgs", now, x, calibration_time=1e-4 * drift)],
-       {"old": lines_of(record("a", "pgs", 1e-3, 1e-8))}, "changes") for words, now, x, drift in (
-        ("20 % slower is noise", 1.2e-3, 1e-8, 1.0), ("twice as slow", 2e-3, 1e-8, 1.0),
-        ("twice as fast", 5e-4, 1e-8, 1.0),
-        ("twice as slow as the machine is", 2e-3, 1e-8, 2.0), ("a solution is lost", 1e-3, 1e-2, 1.0))),
-]  # fmt: skip
+    *(
+        (
+            f"the engine's own answers are {words}",
+            ENGINE,
+            {
+                "answers": {
+                    case: {"solver": "NEWTON", "verdict": "wrong", "seconds": t, "relative": x}
+                    for case, (t, x) in zip("ab", answers, strict=True)
+                }
+            },
+            "rank",
+        )
+        for words, answers in (
+            ("faster", [(1e-5, 1e-9), (2e-5, 1e-9)]),
+            ("slower", [(1e-4, 1e-9), (2e-4, 1e-9)]),
+            ("as fast", [(3.9e-5, 1e-9), (8e-5, 1e-9)]),
+            ("right on one of two cases", [(1e-6, 1e-9), (1e-6, 1e-2)]),
+            ("wrong or without a residual", [(1e-6, 1e-2), (1e-6, math.nan)]),
+        )
+    ),
+    (
+        "an engine that answered one of two problems is not ranked",
+        ENGINE,
+        {"answers": {"a": {"solver": "NEWTON", "verdict": "wrong", "seconds": 1e-5, "relative": 1e-9}}},
+        "rank",
+    ),
+    *(
+        (
+            f"compared with an earlier run, {words}",
+            [record("a", "pgs", now, x, calibration_time=1e-4 * drift)],
+            {"old": lines_of(record("a", "pgs", 1e-3, 1e-8))},
+            "changes",
+        )
+        for words, now, x, drift in (
+            ("20 % slower is noise", 1.2e-3, 1e-8, 1.0),
+            ("twice as slow", 2e-3, 1e-8, 1.0),
+            ("twice as fast", 5e-4, 1e-8, 1.0),
+            ("twice as slow as the machine is", 2e-3, 1e-8, 2.0),
+            ("a solution is lost", 1e-3, 1e-2, 1.0),
+        )
+    ),
+]
 
 
 def describe_report(report, tables_shown):
@@ -187,32 +319,50 @@ def test_rank_solvers_counts_unsolved_and_refused_cases_as_the_time_limit():
     expected = math.sqrt((1e-3 + 1e-5) * (2.0 + 1e-5)) - 1e-5
     assert ranking.loc[["some", "few"], "mean"].to_numpy() == pytest.approx(expected)
     assert ranking[["solved", "tried"]].to_dict("index") == {
-        "all": {"solved": 2, "tried": 2}, "some": {"solved": 1, "tried": 2}, "few": {"solved": 1, "tried": 1}
-    }  # fmt: skip
+        "all": {"solved": 2, "tried": 2},
+        "some": {"solved": 1, "tried": 2},
+        "few": {"solved": 1, "tried": 1},
+    }
 
 
 @pytest.mark.parametrize(
     ("part", "whole", "digits", "text"),
     [
-        (130, 150, 1, "86.7 %"), (25, 150, 1, "16.7 %"), (546, 900, 1, "60.7 %"), (2, 3, 0, "67 %"),
-        (0, 7, 1, "0.0 %"), (7, 7, 0, "100 %"), (1, 3000, 1, "0.03 %"), (2999, 3000, 1, "99.97 %"),
-        (999, 1000, 0, "99.9 %"), (1, 1000, 0, "0.1 %"),
+        (130, 150, 1, "86.7 %"),
+        (25, 150, 1, "16.7 %"),
+        (546, 900, 1, "60.7 %"),
+        (2, 3, 0, "67 %"),
+        (0, 7, 1, "0.0 %"),
+        (7, 7, 0, "100 %"),
+        (1, 3000, 1, "0.03 %"),
+        (2999, 3000, 1, "99.97 %"),
+        (999, 1000, 0, "99.9 %"),
+        (1, 1000, 0, "0.1 %"),
     ],
-)  # fmt: skip
+)
 def test_format_percent_rounds_and_keeps_0_and_100_for_exact_shares(part, whole, digits, text):
     assert format_percent(part, whole, digits) == text
 
 
 def test_format_cells_times_have_one_unit_and_sizes_one_format():
-    frame = pd.DataFrame({
-        "solver": ["a", "b"], "time [s]": [1.5e-3, math.nan], "rows": [3, 4], "residual [-]": [1e-7, 0.5],
-        "x": [2.5, 3.0], "share": ["12 %", "3.1 %"], "none [-]": [math.nan, math.nan], "text": ["", ""],
-    })  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            "solver": ["a", "b"],
+            "time [s]": [1.5e-3, math.nan],
+            "rows": [3, 4],
+            "residual [-]": [1e-7, 0.5],
+            "x": [2.5, 3.0],
+            "share": ["12 %", "3.1 %"],
+            "none [-]": [math.nan, math.nan],
+            "text": ["", ""],
+        }
+    )
     texts = format_cells(frame)
     assert list(texts) == ["solver", "time [ms]", "rows", "residual [-]", "x", "share"]
     assert texts.to_numpy().tolist() == [
-        ["a", "1.50", "3", "1.0e-7", "2.5", "12 %"], ["b", "–", "4", "5.0e-1", "3", "3.1 %"]
-    ]  # fmt: skip
+        ["a", "1.50", "3", "1.0e-7", "2.5", "12 %"],
+        ["b", "–", "4", "5.0e-1", "3", "3.1 %"],
+    ]
     assert list_number_heads(texts) == set(texts) - {"solver"}
     assert list(format_cells(pd.DataFrame({"n": ["x", "y"], "t [s]": [2e-6, 3e-6]}))) == ["n", "t [µs]"]
     sizes = format_cells(pd.DataFrame({"a [-]": [0.35, 0.2], "b [m/s]": [2.9e-3, math.nan]}))

@@ -51,8 +51,11 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
     lines = report.run([p], ["pgs"], QUICK)
     found = rows_of(lines)
     assert [(r.mode, r.tol, r.max_iter) for r in found] == [
-        ("tol", 1e-3, 10_000_000), ("tol", 1e-8, 10_000_000), ("budget", 0.0, 2), ("budget", 0.0, 5)
-    ]  # fmt: skip
+        ("tol", 1e-3, 10_000_000),
+        ("tol", 1e-8, 10_000_000),
+        ("budget", 0.0, 2),
+        ("budget", 0.0, 5),
+    ]
     for r in found:
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter)
         error = again.residual
@@ -65,7 +68,8 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
 
 
 def test_run_timed_call_is_the_printed_line(monkeypatch):
-    calls, true = [], case_kinds.solve
+    calls = []
+    true = case_kinds.solve
 
     def solve(problem, solver, **asked):
         if problem.m > 1:  # A call with one row precedes the timed calls.
@@ -160,7 +164,8 @@ with limit_to_one_thread():
 
 
 def test_store_has_each_row_when_it_is_made(tmp_path):
-    path, seen = tmp_path / "records.jsonl", []
+    path = tmp_path / "records.jsonl"
+    seen = []
 
     def watch(event):
         if event.row is not None:
@@ -180,14 +185,17 @@ SOME = (NAMES[3:], ["pgs", "gauss_seidel"], report.CampaignPlan(tolerances=(1e-3
 @pytest.mark.parametrize(
     ("given", "first", "later"),
     [
-        (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1), (SEQUENCE, 1, 1), (SOME, 1, 2),
+        (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1),
+        (SEQUENCE, 1, 1),
+        (SOME, 1, 2),
         pytest.param(SOME, 2, 1, marks=pytest.mark.nightly),
     ],
     ids=["problems", "sequence", "campaign", "campaign of two workers"],
-)  # fmt: skip
+)
 def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
     """Cut in the middle of lines; impulses that are carried from step to step are restored, too."""
-    path, events = tmp_path / "records.jsonl", []
+    path = tmp_path / "records.jsonl"
+    events = []
 
     def measure(n):
         """Measure with n workers; return the records, and the number of records that were made now."""
@@ -225,7 +233,8 @@ def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
         raise KeyboardInterrupt
 
     plug_in(interrupt, "fake_interrupt")
-    path, into = tmp_path / "records.jsonl", []
+    path = tmp_path / "records.jsonl"
+    into = []
     with pytest.raises(KeyboardInterrupt):
         report.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
     assert {r.solver for r in rows_of(report.read(path))} == {"pgs"}
@@ -249,8 +258,15 @@ def test_write_csv_has_a_row_for_each_run(tmp_path):
 
 
 def test_read_infinite_and_undefined_numbers_are_kept_to_the_last_bit(tmp_path):
-    row = RUN_COLUMNS | {"kind": "run", "run": "r", "case": "stack", "tol": 0.1 + 0.2, "message": "é\n",
-                         "max_iter": 10_000_000, "worst_name": "a\n"}  # fmt: skip
+    row = RUN_COLUMNS | {
+        "kind": "run",
+        "run": "r",
+        "case": "stack",
+        "tol": 0.1 + 0.2,
+        "message": "é\n",
+        "max_iter": 10_000_000,
+        "worst_name": "a\n",
+    }
     case = cases.describe_case(report.resolve_sources([stack(5)])[0], "r")
     with report.Store(tmp_path / "records.jsonl") as opened:
         for entry in ({**machine.describe_run({}), "run": "r"}, case, row):
@@ -288,7 +304,8 @@ def test_run_sequence_carries_each_solvers_own_impulses():
     plan = report.Plan(tolerances=(1e-6,), budgets=(6,), repeats=1)
     found = report.run(report.make_sequence(problems, "load"), ["pgs"], plan)
     found = rows_of(found)
-    impulse, by = problems[0].start(), {(r.start, r.mode, r.step): r for r in found}
+    impulse = problems[0].start()
+    by = {(r.start, r.mode, r.step): r for r in found}
     for i, p in enumerate(problems):
         carried = lv.solve(p, "pgs", impulse=impulse, tol=0.0, max_iter=6)
         impulse = carried.impulse
@@ -305,7 +322,9 @@ def test_run_sequence_carries_each_solvers_own_impulses():
 def record_warm_engine(folder, sweeps, first=30, steps=90):
     """Record a stack at rest of an engine with warm sweeps from a step on; return its velocity errors."""
     rows = lv.Simulation(lv.Scene("stack", n=4)).constraint_problem().rows
-    velocity, last, errors = 0.0, None, []
+    velocity = 0.0
+    last = None
+    errors = []
     with lv.io.Recorder(folder, every=1, solver="own loop") as recorder:
         for step in range(steps):
             moved = dataclasses.replace(rows, v_free=velocity + rows.v_free)  # rows.v_free is that of gravity alone.
@@ -344,7 +363,8 @@ def test_run_sequence_pass_ends_at_its_time_limit_with_a_note(tmp_path, monkeypa
 
 
 def test_records_of_two_sequences_with_one_name_are_kept_apart(tmp_path):
-    path, plan = tmp_path / "records.jsonl", report.Plan(tolerances=(), budgets=(6,), repeats=1)
+    path = tmp_path / "records.jsonl"
+    plan = report.Plan(tolerances=(), budgets=(6,), repeats=1)
     report.run(report.make_sequence(moving_stack(5), "load"), ["pgs"], plan, path)
     report.run(report.make_sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
     frame = report.Report(report.read(path)).newest
@@ -388,11 +408,13 @@ def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path,
 @pytest.mark.parametrize(
     ("backend", "missing", "message"),
     [
-        ("nowhere", "", "'loky' runs processes"), ("loky=here", "", "'loky' runs processes"),
-        ("dask=tcp://127.0.0.1:1", "", "no dask scheduler answers"), ("dask", "", "DASK_SCHEDULER_ADDRESS"),
+        ("nowhere", "", "'loky' runs processes"),
+        ("loky=here", "", "'loky' runs processes"),
+        ("dask=tcp://127.0.0.1:1", "", "no dask scheduler answers"),
+        ("dask", "", "DASK_SCHEDULER_ADDRESS"),
         ("dask", "distributed", r"pip install 'lavender-contact\[cluster\]'"),
     ],
-)  # fmt: skip
+)
 def test_campaign_backend_that_cannot_be_used_is_an_input_error(backend, missing, message, monkeypatch):
     if missing:
         monkeypatch.setitem(sys.modules, missing, None)
@@ -434,10 +456,12 @@ def make_driven_chain(n=6):
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
-        (chain(6), ("chain",)), (make_driven_chain(), ("chain", "redundant")),
+        (chain(6), ("chain",)),
+        (make_driven_chain(), ("chain", "redundant")),
         (suite.case("boxed_friction(n=2)").problem, ("stack", "redundant")),
         (suite.case("boxed_friction(n=3, scene=granular)").problem, ("pile", "redundant")),
-        (lv.Problem.linear(*spd(20)), ("dense",)), (stack(6), ("stack",)),
+        (lv.Problem.linear(*spd(20)), ("dense",)),
+        (stack(6), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
         (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
@@ -446,9 +470,10 @@ def make_driven_chain(n=6):
         (lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)), ("separate", "asymmetric")),
         (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("asymmetric",)),
         (lv.Problem.contact(np.eye(9), np.ones(9), np.full(3, 0.5)), ("separate", "friction")),
-        (make_pile_among_separate_rows(), ("pile",)), (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
+        (make_pile_among_separate_rows(), ("pile",)),
+        (lv.Problem.linear(np.zeros((0, 0)), np.zeros(0)), ("empty",)),
     ],
-)  # fmt: skip
+)
 def test_classify_structure_names_the_largest_component(problem, words):
     assert report.classify_structure(problem) == words
 
@@ -456,11 +481,16 @@ def test_classify_structure_names_the_largest_component(problem, words):
 def test_hash_problem_changes_with_every_number():
     p = stack(5)
     variants = [
-        p, dataclasses.replace(p, b=p.b + 1e-15), dataclasses.replace(p, guess=np.zeros(5)),
-        lv.Problem.lcp(p.matrix, p.b, upper=1.0), lv.Problem.lcp(2 * p.matrix, p.b),
+        p,
+        dataclasses.replace(p, b=p.b + 1e-15),
+        dataclasses.replace(p, guess=np.zeros(5)),
+        lv.Problem.lcp(p.matrix, p.b, upper=1.0),
+        lv.Problem.lcp(2 * p.matrix, p.b),
         lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
-    ]  # fmt: skip
-    jac, mass, v = (np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([-1.0, 0.5]))
+    ]
+    jac = np.array([[1.0, 0.2], [0.0, 1.0]])
+    mass = np.array([[2.0, 0.3], [0.3, 1.0]])
+    v = np.array([-1.0, 0.5])
     for s in (1.0, 2.0):  # one A and one b
         cones = lv.Cones.contacts(0.5, 1)
         variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
@@ -479,8 +509,14 @@ def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(t
     lv.io.save(p, tmp_path / "mixed" / "other.npz")
     items = report.resolve_sources([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
     assert [(i.sequence, i.step) for i in items] == [
-        ("steps", 0), ("steps", 1), ("b/steps", 0), ("b/steps", 1), ("", -1), ("", -1), ("", -1),
-    ]  # fmt: skip
+        ("steps", 0),
+        ("steps", 1),
+        ("b/steps", 0),
+        ("b/steps", 1),
+        ("", -1),
+        ("", -1),
+        ("", -1),
+    ]
     assert all(i.sequence == "" for i in report.resolve_sources([tmp_path / "a" / "steps"], sequences=False))
     alike = report.resolve_sources([tmp_path / "a" / name for name in ("my steps", "My_steps")])
     assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}  # Figures are files named after sequences.

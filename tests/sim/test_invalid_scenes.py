@@ -25,34 +25,69 @@ real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from([s * x for 
 positive = real.map(lambda x: abs(x) or 1.0)
 size = st.sampled_from((0.0, 1e-60, 1e-12, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e8, 1e30, 1e60))
 vector = st.lists(real, min_size=3, max_size=3) | st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3)
-GALLERY = {"stack": {"n": 3}, "pyramid": {"base": 3}, "card_house": {}, "pile": {"n": 12}, "chain": {"n": 6},
-           "bridge": {"n": 4}, "heavy_on_light": {}, "table": {"legs": 4}, "ramp": {}, "spinner": {},
-           "newtons_cradle": {}, "four_bar": {}}  # fmt: skip
+GALLERY = {
+    "stack": {"n": 3},
+    "pyramid": {"base": 3},
+    "card_house": {},
+    "pile": {"n": 12},
+    "chain": {"n": 6},
+    "bridge": {"n": 4},
+    "heavy_on_light": {},
+    "table": {"legs": 4},
+    "ramp": {},
+    "spinner": {},
+    "newtons_cradle": {},
+    "four_bar": {},
+}
 SOLVERS = [name for name in lv.available(external=False) if {"coulomb"} <= lv.get(name).laws]
 ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
-PARAMETERS = st.fixed_dictionaries({}, optional={
-    "seed": st.integers(0, 3), "dt": st.sampled_from((1e-60, 1e-9, 1e-3, 0.1, 1.0, 1e6, 1e60)),
-    "substeps": st.sampled_from((1, 2, 4)), "restitution": st.sampled_from((0.0, 0.5, 1.0)), "gravity": vector,
-    "position_iterations": st.sampled_from((0, 1, 20)), "warm_start": st.booleans(), "friction": size,
-    "patch_radius": size, "slop": size, "margin": size, "restitution_threshold": size,
-})  # fmt: skip
+PARAMETERS = st.fixed_dictionaries(
+    {},
+    optional={
+        "seed": st.integers(0, 3),
+        "dt": st.sampled_from((1e-60, 1e-9, 1e-3, 0.1, 1.0, 1e6, 1e60)),
+        "substeps": st.sampled_from((1, 2, 4)),
+        "restitution": st.sampled_from((0.0, 0.5, 1.0)),
+        "gravity": vector,
+        "position_iterations": st.sampled_from((0, 1, 20)),
+        "warm_start": st.booleans(),
+        "friction": size,
+        "patch_radius": size,
+        "slop": size,
+        "margin": size,
+        "restitution_threshold": size,
+    },
+)
 HOW_SOLVED = st.one_of(
     st.just({}),
     st.fixed_dictionaries({"order": st.sampled_from(ORDERS)}),
-    st.fixed_dictionaries({
-        "solver": st.sampled_from(SOLVERS), "solver_iterations": st.sampled_from((1, 10, 60)),
-        "on_failure": st.sampled_from(("use", "keep", "damp", "raise")),
-    }),
-)  # fmt: skip
-MOTION = {"quaternion": st.lists(real, min_size=4, max_size=4), "inertia": st.lists(positive, min_size=3, max_size=3),
-          "friction": size, "patch_radius": size, "velocity": vector, "angular_velocity": vector}  # fmt: skip
-JOINT_OPTIONS = {"collide": st.booleans(), "hertz": st.sampled_from((0.0, 1e-9, 1.0, 1e9, 1e60)),
-                 "damping": st.sampled_from((0.0, 1.0, 1e60))}  # fmt: skip
+    st.fixed_dictionaries(
+        {
+            "solver": st.sampled_from(SOLVERS),
+            "solver_iterations": st.sampled_from((1, 10, 60)),
+            "on_failure": st.sampled_from(("use", "keep", "damp", "raise")),
+        }
+    ),
+)
+MOTION = {
+    "quaternion": st.lists(real, min_size=4, max_size=4),
+    "inertia": st.lists(positive, min_size=3, max_size=3),
+    "friction": size,
+    "patch_radius": size,
+    "velocity": vector,
+    "angular_velocity": vector,
+}
+JOINT_OPTIONS = {
+    "collide": st.booleans(),
+    "hertz": st.sampled_from((0.0, 1e-9, 1.0, 1e9, 1e60)),
+    "damping": st.sampled_from((0.0, 1.0, 1e60)),
+}
 MOTOR = {"motor_speed": real, "motor_torque": st.sampled_from((0.0, 1.0, 1e9, 1e60))}
 SHAPES = {"body": {}, "sphere": {"radius": positive}, "box": {"size": st.lists(positive, min_size=3, max_size=3)}}
 UNCHANGING = ("save", "problem", "residual")  # Actions that change nothing.
-ACTIONS = st.sampled_from((*UNCHANGING, "few sweeps", "many sweeps", "cold", "warm", "snapshot", "restore", "reset",
-                           "seed"))  # fmt: skip
+ACTIONS = st.sampled_from(
+    (*UNCHANGING, "few sweeps", "many sweeps", "cold", "warm", "snapshot", "restore", "reset", "seed")
+)
 
 
 @st.composite
@@ -72,8 +107,11 @@ def bodies(draw):
 def joints(n):
     """Joints between two of n bodies or the world."""
     ends = {"a": st.integers(-1, n - 1), "b": st.integers(-1, n - 1)}
-    kinds = (("ball", {"anchor": vector}, {}), ("hinge", {"anchor": vector, "axis": vector}, MOTOR),
-             ("distance", {"anchor_a": vector}, {"length": size}))  # fmt: skip
+    kinds = (
+        ("ball", {"anchor": vector}, {}),
+        ("hinge", {"anchor": vector, "axis": vector}, MOTOR),
+        ("distance", {"anchor_a": vector}, {"length": size}),
+    )
     strategies = (
         st.fixed_dictionaries({"kind": st.just(kind)} | ends | fields, optional=JOINT_OPTIONS | options)
         for kind, fields, options in kinds
@@ -144,7 +182,9 @@ def check_observation(observation, terminated, info):
 
 def play(data, path, inspect=True):
     """Step a scene, with or without the actions that change nothing; return a hash of all observations."""
-    simulation, seen, snapshot = lv.Simulation(build_scene(data)), hashlib.sha256(), None
+    simulation = lv.Simulation(build_scene(data))
+    seen = hashlib.sha256()
+    snapshot = None
     for action in data["actions"]:
         if isinstance(action, str):
             if inspect or action not in UNCHANGING:
@@ -200,12 +240,20 @@ ON_BOX = [PLANE, box(1.0, z=0.5)]
 #: Scenes from which nothing may be lost in 240 steps.
 LASTING = {
     "on one place": [*[box(1.0)] * 5, *[sphere(0.5, 3.0)] * 3, sphere(0.5), {"add": "plane", "offset": 0.3}],
-    "flat boxes": [PLANE, *(b for i in range(4) for b in (
-        box([1e-6, 1.0, 1.0], 0.1 * i, z=0.6, quaternion=tilted(0.1 * i)),
-        box([1e-3, 1e-3, 10.0], 0.2 * i, 2.0, 5.0)))],
+    "flat boxes": [
+        PLANE,
+        *(
+            b
+            for i in range(4)
+            for b in (
+                box([1e-6, 1.0, 1.0], 0.1 * i, z=0.6, quaternion=tilted(0.1 * i)),
+                box([1e-3, 1e-3, 10.0], 0.2 * i, 2.0, 5.0),
+            )
+        ),
+    ],
     **{f"sizes of {x:g}": [*ON_BOX, sphere(0.5 * x, z=1.0 + 0.5 * x), box(x, 0.2, z=1.0 + x)] for x in (1e-6, 1e6)},
     **{f"masses of {x:g}": [*ON_BOX, box(1.0, z=1.5, mass=x)] for x in (1e-6, 1e6)},
-}  # fmt: skip
+}
 
 
 @pytest.mark.filterwarnings("error")
@@ -227,9 +275,14 @@ NUMBERS = {
     name=st.sampled_from(sorted(GALLERY)),
     how=HOW_SOLVED,
     steps=st.integers(0, 6),
-    edits=st.lists(st.sampled_from(("size", *["index"] * 3, "real", "keys")).flatmap(
-        lambda name: st.tuples(st.just(name), st.integers(0, 10**6), NUMBERS[name])), min_size=1, max_size=5),
-)  # fmt: skip
+    edits=st.lists(
+        st.sampled_from(("size", *["index"] * 3, "real", "keys")).flatmap(
+            lambda name: st.tuples(st.just(name), st.integers(0, 10**6), NUMBERS[name])
+        ),
+        min_size=1,
+        max_size=5,
+    ),
+)
 def test_snapshot_with_changed_arrays_is_rejected_or_stepped(name, how, steps, edits):
     """A changed state may compute anything, but it reads and writes only within its arrays."""
     simulation = after(steps, name, **GALLERY[name], **how | {"on_failure": "use"})

@@ -29,8 +29,10 @@ PROBLEMS = {
 
 def play(monkeypatch, clock, pace, problem):
     """The clock goes by what sweeps, steps that factor and analyses of `auto` are counted for, times `pace`."""
-    sweep, newton = SweepSolver.run, registry.get("newton").load()
-    prepare, quiet = newton.prepare, []
+    sweep = SweepSolver.run
+    newton = registry.get("newton").load()
+    prepare = newton.prepare
+    quiet = []
 
     def swept(*of):
         found = sweep(*of)
@@ -66,7 +68,8 @@ def play(monkeypatch, clock, pace, problem):
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("pace", [0.3, 1.0, 2.0, 3.0])
 def test_auto_with_more_time_is_not_worse(name, pace, clock, monkeypatch):
-    problem, found = PROBLEMS[name](), []
+    problem = PROBLEMS[name]()
+    found = []
     play(monkeypatch, clock, pace, problem)
     for limit in LIMITS:
         clock.now = 0.0

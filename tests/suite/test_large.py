@@ -10,13 +10,21 @@ from lavender import suite
 TOL = 1e-6
 #: `auto` solves these in less than a second each.
 SOLVED = (
-    "granularF(n=6)", "granularF(n=6, sliding=0.5)", "wall(n=10)", "wall(n=10, sliding=0.5)", "pyramidF(k=16)",
+    "granularF(n=6)",
+    "granularF(n=6, sliding=0.5)",
+    "wall(n=10)",
+    "wall(n=10, sliding=0.5)",
+    "pyramidF(k=16)",
     "pyramidF(k=16, sliding=0.5)",
-)  # fmt: skip
+)
 #: `auto` solves these in 0.1 to 3 seconds each.
 SOLVED_NIGHTLY = (
-    "granularF(n=6, sliding=2, seed=4)", "granularF(n=11)", "wall(n=25)", "wall(n=25, sliding=0.1)", "pyramidF(k=40)",
-)  # fmt: skip
+    "granularF(n=6, sliding=2, seed=4)",
+    "granularF(n=11)",
+    "wall(n=25)",
+    "wall(n=25, sliding=0.1)",
+    "pyramidF(k=40)",
+)
 
 
 def compute_residual(problem, impulse):

@@ -24,13 +24,16 @@ def test_admm_under_coulomb_with_mass_ratios_converges(ratio, speed):
 @pytest.mark.parametrize(
     "problem",
     [
-        lambda: suite.stack(n=200).problem, lambda: suite.hang(n=24).problem, lambda: suite.granular(n=4).problem,
+        lambda: suite.stack(n=200).problem,
+        lambda: suite.hang(n=24).problem,
+        lambda: suite.granular(n=4).problem,
         lambda: suite.granular(n=3, friction="coulomb").problem,
         lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"),
         lambda: suite.pyramid(k=6, mass_ratio=1e6).problem,
-        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem, lambda: wild(seed=7921).problem,
+        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem,
+        lambda: wild(seed=7921).problem,
     ],
-)  # fmt: skip
+)
 def test_auto_stages_sum_to_the_work_and_end_at_the_residual(problem):
     problem = problem()
     solution = lv.solve(problem, "auto", tol=1e-6)
@@ -105,7 +108,8 @@ def test_euler_steps_pile_slides_solves_coulomb_and_shifted_cone_law():
     # De Saxce: with the normals lowered by mu |v_t| the impulse solves the cone law.
     matrix = as_matrix(problem)
     slack = matrix.matrix @ impulse - matrix.b
-    normal, tangents = problem.cones.normal_rows, slack.reshape(-1, 3)[:, 1:]
+    normal = problem.cones.normal_rows
+    tangents = slack.reshape(-1, 3)[:, 1:]
     shift = problem.cones.mu * np.linalg.norm(tangents, axis=1)
     b = matrix.b.copy()
     b[normal] -= shift

@@ -19,7 +19,8 @@ def test_admm_under_a_short_limit_forms_no_matrix():
     assert late.impulse.tobytes() == problem.start().tobytes()
     prepared = lv.prepare(problem, "admm")
     assert prepared.solve(time_limit=1e-4).status is lv.Status.TIME_LIMIT
-    after, whole = prepared.solve(max_iter=5), lv.solve(problem, "admm", max_iter=5)
+    after = prepared.solve(max_iter=5)
+    whole = lv.solve(problem, "admm", max_iter=5)
     assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()
 
 
@@ -46,7 +47,8 @@ def test_auto_solves_few_rows_that_one_solver_alone_does_not(seed):
     ],
 )
 def test_newton_on_drawn_problems_takes_few_factorisations(seed, sweeps, most, words):
-    problem, start = wild(seed=seed, rows=120 if seed == 807 else 3000).problem, None
+    problem = wild(seed=seed, rows=120 if seed == 807 else 3000).problem
+    start = None
     if sweeps:
         problem = as_matrix(problem)
         start = lv.solve(problem, "anderson", tol=0.0, max_iter=sweeps).impulse

@@ -71,15 +71,24 @@ RESTS = [
     ("duplicated(k=3)", {"omega": 1.0}, {"jacobi": 72}),
     ("duplicated(k=8)", {"omega": 1.0}, {"jacobi": 72}),
     (
-        "infeasible(kind=squeeze)", {},
+        "infeasible(kind=squeeze)",
+        {},
         {"pgs": 88, "sequential_impulses": 88, "block_gauss_seidel": 88, "nncg": 517, "anderson": 922},
     ),
     (
-        "infeasible(kind=joints)", {},
-        {"pgs": 72, "sequential_impulses": 72, "block_gauss_seidel": 72, "gauss_seidel": 72, "sor": 114, "nncg": 578,
-         "anderson": 518},
+        "infeasible(kind=joints)",
+        {},
+        {
+            "pgs": 72,
+            "sequential_impulses": 72,
+            "block_gauss_seidel": 72,
+            "gauss_seidel": 72,
+            "sor": 114,
+            "nncg": 578,
+            "anderson": 518,
+        },
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("text", "options", "sweeps"), RESTS)

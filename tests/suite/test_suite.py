@@ -124,7 +124,8 @@ def multiply_exactly(matrix, x):
 
 @pytest.mark.parametrize("name", load_references())
 def test_stored_solution_meets_every_condition_to_its_digits(name):
-    stored, problem = load_references()[name], suite.case(name).problem
+    stored = load_references()[name]
+    problem = suite.case(name).problem
     assert hash_problem(problem) == stored["sha"]
     lam = [Fraction(Decimal(digits)) for digits in stored["impulse"].split()]
     if problem.rows is None:
@@ -132,9 +133,11 @@ def test_stored_solution_meets_every_condition_to_its_digits(name):
     else:
         factors = [problem.jacobian.T, problem.rows.inverse_mass_matrix(), problem.jacobian]
         assert not problem.compliance.any()
-    speed, size = lam, np.abs(np.array(lam, float))
+    speed = lam
+    size = np.abs(np.array(lam, float))
     for factor in factors:
-        speed, size = multiply_exactly(factor, speed), abs(factor) @ size
+        speed = multiply_exactly(factor, speed)
+        size = abs(factor) @ size
     b = [Fraction(x) for x in problem.b.tolist()]
     # Unique impulses have 31 digits. Equations of dependent rows, with rounded data, hold only to rounding.
     unit = Fraction(1, 10**30) if stored["compare"] == "impulse" else Fraction(1, 2**49)
@@ -143,10 +146,12 @@ def test_stored_solution_meets_every_condition_to_its_digits(name):
     c = problem.cones
     lower, upper = c.lower.tolist(), c.upper.tolist()
     for i in np.flatnonzero(c.kind != lv.cones.ROW):
-        first, end = c.ptr[i], c.ptr[i + 1]
+        first = c.ptr[i]
+        end = c.ptr[i + 1]
         friction = sum((x * x for x in lam[first + 1 : end]), Fraction(0))
         assert friction <= (Fraction(float(c.mu[i])) * lam[first]) ** 2
-        lower[first], upper[first] = 0.0, np.inf
+        lower[first] = 0.0
+        upper[first] = np.inf
         lower[first + 1 : end] = [-np.inf] * (end - first - 1)  # nothing slides: w is 0 on all rows
     for low, high, impulse, slack in zip(lower, upper, lam, np.array(speed, object) - np.array(b, object), strict=True):
         assert low - excess <= float(impulse) <= high + excess

@@ -35,7 +35,8 @@ def asymmetric():
 
 def transport_plan():
     """k^2 velocities couple by 2 k sums: N over velocities is full, and A has a few entries in each row."""
-    k, rng = 30, np.random.default_rng(3)
+    k = 30
+    rng = np.random.default_rng(3)
     sums = sp.vstack([sp.kron(sp.eye(k), np.ones((1, k))), sp.kron(np.ones((1, k)), sp.eye(k))])
     load = np.concatenate([rng.dirichlet(np.ones(k)) for _ in range(2)])
     program = {"A": sums.tocsc(), "b": load, "lb": np.zeros(k * k)}
@@ -101,10 +102,11 @@ def test_stages_that_auto_plans_are_the_approved_ones():
         tree = DecisionTree(problem)
         round_of_turns = [stage.solver for stage in tree.iterate_one_round(1.0)]
         lines += [
-            name, f"    small call  {(plan.small or 'none').partition(', counted')[0]}",
+            name,
+            f"    small call  {(plan.small or 'none').partition(', counted')[0]}",
             f"    stages      {', '.join(s.solver for s in plan.stages if 'in turn' not in s.why) or 'none'}",
             f"    one round   {', '.join(round_of_turns) or 'none'}",
-        ]  # fmt: skip
+        ]
     lines.append("turns of admm by the residuals after each")
     for residuals in ([1e-2, 1e-2], [1e-2, 1e-3], [1e-2, 0.9e-4, 3e-5], [1e-2, 0.9e-4, 2e-6, 2e-6]):
         lines.append(f"    {', '.join(f'{x:.0e}' for x in residuals):32} {list_turns(residuals)}")
@@ -119,7 +121,8 @@ def test_auto_solves_a_problem_of_each_kind_also_without_a_small_call(name):
 
 def test_explain_is_reproducible_and_rejects_wrong_input():
     problem = suite.granular(n=3, friction="coulomb").problem
-    first, second = lv.explain(problem), lv.explain(suite.granular(n=3, friction="coulomb").problem)
+    first = lv.explain(problem)
+    second = lv.explain(suite.granular(n=3, friction="coulomb").problem)
     assert first == second and json.loads(json.dumps(first.data()))["rows"] == problem.m
     for tol in (0.0, -1.0, np.inf):
         with pytest.raises(lv.InputError, match="tol is"):
@@ -145,7 +148,9 @@ def test_auto_solves_problems_that_only_late_stages_solve(make):
 
 def test_auto_continues_over_rows_of_a_if_newton_over_velocities_fails():
     rng = np.random.default_rng(8)
-    half, jac, moved = (rng.standard_normal((150, 150)), rng.standard_normal((400, 150)), rng.standard_normal(150))
+    half = rng.standard_normal((150, 150))
+    jac = rng.standard_normal((400, 150))
+    moved = rng.standard_normal(150)
     target = jac @ moved - rng.exponential(0.5, 400) * (rng.random(400) < 0.7)
     cones = lv.Cones.bounded(np.zeros(400), np.full(400, np.inf))
     problem = lv.Problem.from_jacobian(jac, half @ half.T, np.zeros(150), target=target, cones=cones)
@@ -157,9 +162,12 @@ def test_auto_continues_over_rows_of_a_if_newton_over_velocities_fails():
 @pytest.mark.parametrize("contacts", [10, 40])
 def test_auto_solves_contacts_whose_rows_have_unlike_units(contacts, friction):
     rng = np.random.default_rng(contacts)
-    m, unit = 3 * contacts, 10.0 ** rng.uniform(-2.0, 2.0, 3 * contacts)
-    half, b = rng.standard_normal((m, 2 * m)), rng.standard_normal(m)
-    matrix, cones = (unit[:, None] * (half @ half.T) * unit / m, lv.Cones.contacts(rng.uniform(0.2, 1.0, contacts)))
+    m = 3 * contacts
+    unit = 10.0 ** rng.uniform(-2.0, 2.0, 3 * contacts)
+    half = rng.standard_normal((m, 2 * m))
+    b = rng.standard_normal(m)
+    matrix = unit[:, None] * (half @ half.T) * unit / m
+    cones = lv.Cones.contacts(rng.uniform(0.2, 1.0, contacts))
     solution = lv.solve(lv.Problem(unit * b, cones, matrix, friction=friction))
     assert solution.success, solution.message
 
@@ -186,7 +194,8 @@ def test_auto_with_a_velocity_moved_by_1e_47_only_proves_the_conflict(unit):
     """
     rng = np.random.default_rng(0)
     jac = np.hstack([rng.standard_normal((9, 6)), np.zeros((9, 1))])
-    jac[3], jac[8] = -jac[0], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-47]
+    jac[3] = -jac[0]
+    jac[8] = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-47]
     target = rng.standard_normal(9)
     target[::3] = 3.0 * np.abs(target[::3])
     cones = lv.Cones.contacts(0.3, count=3)

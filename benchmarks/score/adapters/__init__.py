@@ -89,11 +89,16 @@ def make_tree(scene: Scene) -> list[Link]:
         if b["kinematic"]:
             speed = sum(v * v for v in b["velocity"]) ** 0.5
             links.append(
-                Link(i, -1, b["position"], [v / speed for v in b["velocity"]], True, (speed, 1e9), [])
+                Link(
+                    i, -1, b["position"], [v / speed for v in b["velocity"]], True, (speed, 1e9), []
+                )
             )
         elif hinges:
-            first, loops = hinges[0], [hinge["anchor"] for hinge in hinges[1:]]
-            links.append(Link(i, first["a"], first["anchor"], first["axis"], False, first["motor"], loops))
+            first = hinges[0]
+            loops = [hinge["anchor"] for hinge in hinges[1:]]
+            links.append(
+                Link(i, first["a"], first["anchor"], first["axis"], False, first["motor"], loops)
+            )
     return links
 
 

@@ -6,21 +6,32 @@ from typing import Any
 
 import Box2D as box2d
 
-from benchmarks.score.adapters import Options, Running, Scene, get_half, get_moving, get_radius, has_ground
+from benchmarks.score.adapters import (
+    Options,
+    Running,
+    Scene,
+    get_half,
+    get_moving,
+    get_radius,
+    has_ground,
+)
 from benchmarks.score.adapters.plane import PlaneScene
 
 
 def build(scene: Scene, options: Options) -> Running:
     """Use `b2World.Step`; options are `velocity` and `position`, the numbers of iterations, and `sleep`."""
     flat = PlaneScene(scene)
-    world = box2d.b2World(gravity=flat.project(scene["gravity"]), doSleep=options.get("sleep", True))
+    world = box2d.b2World(
+        gravity=flat.project(scene["gravity"]), doSleep=options.get("sleep", True)
+    )
     material = {"friction": scene["friction"], "restitution": scene["restitution"]}
     ground = world.CreateStaticBody()
     if has_ground(scene):
         ground.CreateFixture(
             box2d.b2FixtureDef(shape=box2d.b2PolygonShape(box=(100, 1, (0, -1), 0)), **material)
         )
-    bodies, moving = [], get_moving(scene)
+    bodies = []
+    moving = get_moving(scene)
     for b in moving:
         half = get_half(b)
         shape = (

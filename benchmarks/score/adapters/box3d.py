@@ -11,12 +11,13 @@ from robox3d.core.world import lib
 from benchmarks.score import adapters as tools
 
 
-# fmt: off
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     """Use `World.step`; options are `substeps`, `sleep` and `bounce_speed`."""
-    steps, sleep = options.get("substeps", 4), options.get("sleep", True)
+    steps = options.get("substeps", 4)
+    sleep = options.get("sleep", True)
     world = robox3d.World(scene["gravity"], substeps=steps, enable_sleep=sleep)
-    moving, bodies = tools.get_moving(scene), []
+    moving = tools.get_moving(scene)
+    bodies = []
     if "bounce_speed" in options:
         lib.b3World_SetRestitutionThreshold(world.id, options["bounce_speed"])
     material = {"friction": scene["friction"], "restitution": scene["restitution"]}
@@ -24,7 +25,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     if tools.has_ground(scene):
         ground.add_box((100, 100, 1), **material)
     for b in moving:
-        turn, kind = tools.shift(b["quaternion"]), "kinematic" if b["kinematic"] else "dynamic"
+        turn = tools.shift(b["quaternion"])
+        kind = "kinematic" if b["kinematic"] else "dynamic"
         body = world.create_body(b["position"], rotation=turn, kind=kind)
         half = tools.get_half(b)
         body.add_box(half, **material) if half else body.add_sphere(tools.get_radius(b), **material)
@@ -36,7 +38,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         first = bodies[joint["a"]] if joint["a"] >= 0 else ground
         motor = joint["motor"][::-1] if joint["motor"] else None
         how = {"motor": motor, "constraint_hertz": None}
-        world.create_revolute_joint(first, bodies[joint["b"]], joint["anchor"], joint["axis"], **how)
+        world.create_revolute_joint(
+            first, bodies[joint["b"]], joint["anchor"], joint["axis"], **how
+        )
 
     def step() -> None:
         for body, b in zip(bodies, moving, strict=True):
@@ -45,7 +49,13 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         world.step(options["dt"])
 
     def get_row(r: Any) -> list[Any]:
-        return [*r.position, r.rotation[3], *r.rotation[:3], *r.linear_velocity, *r.angular_velocity]
+        return [
+            *r.position,
+            r.rotation[3],
+            *r.rotation[:3],
+            *r.linear_velocity,
+            *r.angular_velocity,
+        ]
 
     def properties() -> list[Any]:
         rows = []
@@ -54,4 +64,6 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
             rows.append([r.mass, inertia.cx.x, inertia.cy.y, inertia.cz.z, None, None])
         return rows
 
-    return tools.Running(step, lambda: [get_row(r) for r in bodies], properties, close=world.destroy)
+    return tools.Running(
+        step, lambda: [get_row(r) for r in bodies], properties, close=world.destroy
+    )

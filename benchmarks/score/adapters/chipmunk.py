@@ -6,13 +6,23 @@ from typing import Any
 
 import pymunk
 
-from benchmarks.score.adapters import Options, Running, Scene, get_half, get_moving, get_radius, has_ground
+from benchmarks.score.adapters import (
+    Options,
+    Running,
+    Scene,
+    get_half,
+    get_moving,
+    get_radius,
+    has_ground,
+)
 from benchmarks.score.adapters.plane import PlaneScene
 
 
 def build(scene: Scene, options: Options) -> Running:
     """Use `Space.step`; options are attributes of the space."""
-    flat, space, moving = PlaneScene(scene), pymunk.Space(), get_moving(scene)
+    flat = PlaneScene(scene)
+    space = pymunk.Space()
+    moving = get_moving(scene)
     space.gravity = flat.project(scene["gravity"])
     for key, value in options.items():
         if key != "dt":
@@ -26,7 +36,9 @@ def build(scene: Scene, options: Options) -> Running:
     for body, b in zip(bodies, moving, strict=True):
         half, radius = get_half(b), get_radius(b)
         shapes.append(
-            pymunk.Poly.create_box(body, (2 * half[0], 2 * half[2])) if half else pymunk.Circle(body, radius)
+            pymunk.Poly.create_box(body, (2 * half[0], 2 * half[2]))
+            if half
+            else pymunk.Circle(body, radius)
         )
         body.position, body.angle = flat.project(b["position"]), flat.get_angle(b["quaternion"])
         body.velocity = flat.project(b["velocity"])

@@ -10,13 +10,16 @@ import numpy as np
 from benchmarks.score import adapters as tools
 
 
-# fmt: off
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     """Use `World.step`; options are `solver`, the name of a class, `detector`, and `split` impulses."""
-    world, moving, links = dart.simulation.World(), tools.get_moving(scene), {k.body: k for k in tools.make_tree(scene)}
+    world = dart.simulation.World()
+    moving = tools.get_moving(scene)
+    links = {k.body: k for k in tools.make_tree(scene)}
     world.setTimeStep(options["dt"])
     world.setGravity(np.array(scene["gravity"]))
-    solver, nodes, commands = world.getConstraintSolver(), [], []
+    solver = world.getConstraintSolver()
+    nodes = []
+    commands = []
     if "detector" in options:
         solver.setCollisionDetector(getattr(dart.collision, options["detector"])())
     if "split" in options:
@@ -25,12 +28,18 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         solver.setBoxedLcpSolver(getattr(dart.constraint, options["solver"])())
 
     def add_shape(node: Any, half: Any, radius: float) -> None:
-        shape = dart.dynamics.BoxShape(2.0 * np.array(half)) if half else dart.dynamics.SphereShape(radius)
+        shape = (
+            dart.dynamics.BoxShape(2.0 * np.array(half))
+            if half
+            else dart.dynamics.SphereShape(radius)
+        )
         made = node.createShapeNode(shape)
         made.createCollisionAspect()
         aspect = made.createDynamicsAspect()
         aspect.setFrictionCoeff(scene["friction"])  # The smaller coefficient of a pair counts.
-        aspect.setRestitutionCoeff(scene["restitution"] ** 0.5)  # The restitution of a pair is the product.
+        aspect.setRestitutionCoeff(
+            scene["restitution"] ** 0.5
+        )  # The restitution of a pair is the product.
 
     def move(vector: Any) -> Any:
         transform = dart.math.Isometry3()

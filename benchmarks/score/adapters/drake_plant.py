@@ -16,25 +16,32 @@ import pydrake.all as drake  # noqa: E402
 logging.getLogger("drake").setLevel(logging.ERROR)
 
 
-# fmt: off
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     """Use `AdvanceTo`; options are `approximation`, `stiction` [m/s] and `hydroelastic`, a mesh resolution."""
     if scene["restitution"]:
-        raise tools.CannotExpress("no restitution coefficient, only dissipation or a relaxation time")
+        raise tools.CannotExpress(
+            "no restitution coefficient, only dissipation or a relaxation time"
+        )
     if len(tools.make_tree(scene)) < len(scene["joints"]):
         raise tools.CannotExpress("the adapter closes no loops")
-    moving, links = tools.get_moving(scene), {link.body: link for link in tools.make_tree(scene)}
+    moving = tools.get_moving(scene)
+    links = {link.body: link for link in tools.make_tree(scene)}
     builder = drake.DiagramBuilder()
     plant, _ = drake.AddMultibodyPlantSceneGraph(builder, time_step=options["dt"])
     plant.mutable_gravity_field().set_gravity_vector(scene["gravity"])
     if "approximation" in options:
-        plant.set_discrete_contact_approximation(getattr(drake.DiscreteContactApproximation, options["approximation"]))
+        plant.set_discrete_contact_approximation(
+            getattr(drake.DiscreteContactApproximation, options["approximation"])
+        )
     if "stiction" in options:
         plant.set_stiction_tolerance(options["stiction"])
 
     def add_shape(body: Any, shape: Any, name: str, size: float, rigid: bool) -> None:
-        made, fine = drake.ProximityProperties(), options.get("hydroelastic")
-        drake.AddContactMaterial(friction=drake.CoulombFriction(scene["friction"], scene["friction"]), properties=made)
+        made = drake.ProximityProperties()
+        fine = options.get("hydroelastic")
+        drake.AddContactMaterial(
+            friction=drake.CoulombFriction(scene["friction"], scene["friction"]), properties=made
+        )
         if fine and rigid:
             drake.AddRigidHydroelasticProperties(size, made)
         elif fine:
@@ -42,7 +49,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         plant.RegisterCollisionGeometry(body, drake.RigidTransform(), shape, name, made)
 
     def add_frame(name: str, body: Any, offset: Any) -> Any:
-        return plant.AddFrame(drake.FixedOffsetFrame(name, body, drake.RigidTransform(np.array(offset, float))))
+        return plant.AddFrame(
+            drake.FixedOffsetFrame(name, body, drake.RigidTransform(np.array(offset, float)))
+        )
 
     if tools.has_ground(scene):
         add_shape(plant.world_body(), drake.HalfSpace(), "ground", 1.0, True)
@@ -63,7 +72,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
             kind = drake.PrismaticJoint if link.slides else drake.RevoluteJoint
             joint = plant.AddJoint(kind(f"j{i}", first, second, np.array(link.axis)))
             joints.append((joint, link))
-            if link.drive and not link.slides:  # The torque falls below its limit within 1 % of the speed.
+            if (
+                link.drive and not link.slides
+            ):  # The torque falls below its limit within 1 % of the speed.
                 gains = drake.PdControllerGains(p=1e-9, d=100 * link.drive[1] / link.drive[0])
                 plant.AddJointActuator(f"m{i}", joint, link.drive[1]).set_controller_gains(gains)
     plant.Finalize()
@@ -74,10 +85,13 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         if i not in links:
             pose = drake.RigidTransform(drake.Quaternion(b["quaternion"]), b["position"])
             plant.SetFreeBodyPose(context, body, pose)
-            plant.SetFreeBodySpatialVelocity(body, drake.SpatialVelocity(b["spin"], b["velocity"]), context)
+            plant.SetFreeBodySpatialVelocity(
+                body, drake.SpatialVelocity(b["spin"], b["velocity"]), context
+            )
         if any(b["force"]):
             push = drake.ExternallyAppliedSpatialForce()
-            push.body_index, push.F_Bq_W = body.index(), drake.SpatialForce(np.zeros(3), np.array(b["force"]))
+            push.body_index = body.index()
+            push.F_Bq_W = drake.SpatialForce(np.zeros(3), np.array(b["force"]))
             pushes.append(push)
     if pushes:
         plant.get_applied_spatial_force_input_port().FixValue(context, pushes)
@@ -104,6 +118,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
 
     def properties() -> list[Any]:
         inertias = [body.CalcSpatialInertiaInBodyFrame(context) for body in bodies]
-        return [[m.get_mass(), *m.CalcRotationalInertia().get_moments(), None, None] for m in inertias]
+        return [
+            [m.get_mass(), *m.CalcRotationalInertia().get_moments(), None, None] for m in inertias
+        ]
 
     return tools.Running(step, state, properties)

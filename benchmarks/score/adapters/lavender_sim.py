@@ -10,7 +10,9 @@ from benchmarks.score.adapters import Options, Running, Scene, get_moving, get_r
 
 def build(scene: Scene, options: Options) -> Running:
     """Use `Simulation.step`; options are parameters of the scene."""
-    dt, gravity, moving = options["dt"], np.array(scene["gravity"]), get_moving(scene)
+    dt = options["dt"]
+    gravity = np.array(scene["gravity"])
+    moving = get_moving(scene)
     materials = {"friction": scene["friction"], "restitution": scene["restitution"]}
     built = lv.Scene(gravity=tuple(gravity), **materials, **options)
     if has_ground(scene):
@@ -18,7 +20,12 @@ def build(scene: Scene, options: Options) -> Running:
     first = built.n_bodies
     for b in moving:
         motion = {"velocity": b["velocity"], "angular_velocity": b["spin"]}
-        more = {"mass": b["mass"], "position": b["position"], "quaternion": b["quaternion"], **motion}
+        more = {
+            "mass": b["mass"],
+            "position": b["position"],
+            "quaternion": b["quaternion"],
+            **motion,
+        }
         built.add_sphere(get_radius(b), **more) if get_radius(b) else built.add_box(
             b["shape"]["size"], **more
         )
@@ -34,16 +41,23 @@ def build(scene: Scene, options: Options) -> Running:
             if b["kinematic"]:
                 sim.set_velocity(i, b["velocity"] - gravity * dt)
             elif any(b["force"]):
-                sim.set_velocity(i, observed[0]["velocities"][i, :3] + np.array(b["force"]) * dt / b["mass"])
+                sim.set_velocity(
+                    i, observed[0]["velocities"][i, :3] + np.array(b["force"]) * dt / b["mass"]
+                )
         observed[0] = sim.step()[0]
 
     def state() -> list[np.ndarray]:
         return list(
-            np.hstack([observed[0][key][first:] for key in ("positions", "quaternions", "velocities")])
+            np.hstack(
+                [observed[0][key][first:] for key in ("positions", "quaternions", "velocities")]
+            )
         )
 
     def properties() -> list[list[float]]:
         p = sim.scene.parameters  # No body has values of its own.
-        return [[b.mass, *np.diag(b.inertia), p.friction, p.restitution] for b in sim.scene.bodies[first:]]
+        return [
+            [b.mass, *np.diag(b.inertia), p.friction, p.restitution]
+            for b in sim.scene.bodies[first:]
+        ]
 
     return Running(step, state, properties, lambda: float(sim.residual()["velocity"]), sim.close)

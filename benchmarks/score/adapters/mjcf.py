@@ -22,7 +22,8 @@ def join(numbers: Any) -> str:
 
 def make_contact(scene: dict[str, Any], dt: float, hard: bool) -> str:
     """Return the contact attributes; a restitution needs `hard`: a spring and damper whose contact lasts ten steps."""
-    e, friction = scene["restitution"], SHIPPED.format(scene["friction"])
+    e = scene["restitution"]
+    friction = SHIPPED.format(scene["friction"])
     if e and not hard:
         raise CannotExpress("no restitution coefficient, only the damping ratio of a soft contact")
     if not hard:
@@ -35,10 +36,13 @@ def make_contact(scene: dict[str, Any], dt: float, hard: bool) -> str:
 def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bool = False) -> str:
     """Return the MJCF of a scene; `options` are attributes of `<option>`."""
     loops = motors = ""
-    moving, world = get_moving(scene), ""
+    moving = get_moving(scene)
+    world = ""
     children: dict[int, str] = {}
     for i in reversed(range(len(moving))):
-        b, radius, ties = moving[i], get_radius(moving[i]), ""
+        b = moving[i]
+        radius = get_radius(moving[i])
+        ties = ""
         joints = [joint for joint in scene["joints"] if joint["b"] == i]
         a = joints[0]["a"] if joints else -1
         for k, joint in enumerate(joints):
@@ -52,7 +56,11 @@ def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bo
                 motors += f'<velocity joint="j{i}" kv="{100 * limit / speed}" forcerange="{-limit} {limit}"/>'
         if b["kinematic"]:
             ties = f'<joint type="slide" axis="{join(b["velocity"])}"/>'
-        shape = f'type="box" size="{join(get_half(b))}"' if not radius else f'type="sphere" size="{radius}"'
+        shape = (
+            f'type="box" size="{join(get_half(b))}"'
+            if not radius
+            else f'type="sphere" size="{radius}"'
+        )
         start = np.subtract(b["position"], moving[a]["position"] if a >= 0 else 0.0)
         body = (
             f'<body name="b{i}" pos="{join(start)}" quat="{join(b["quaternion"])}" gravcomp="{int(b["kinematic"])}">'
@@ -77,7 +85,10 @@ def get_start(scene: dict[str, Any]) -> tuple[list[float], list[list[float]], li
     velocity: list[float] = []
     for i, b in enumerate(get_moving(scene)):
         joined = any(joint["b"] == i for joint in scene["joints"])
-        free = [*b["velocity"], *b["spin"]]  # All bodies that spin start with the identity as orientation.
+        free = [
+            *b["velocity"],
+            *b["spin"],
+        ]  # All bodies that spin start with the identity as orientation.
         velocity += [math.hypot(*b["velocity"])] if b["kinematic"] else [0.0] if joined else free
     forces = [b["force"] for b in get_moving(scene)]
     return velocity, forces, [joint["motor"][0] for joint in scene["joints"] if joint["motor"]]

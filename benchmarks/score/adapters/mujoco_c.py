@@ -16,7 +16,9 @@ from benchmarks.score.adapters.mjcf import get_start, make_xml
 def build(scene: Scene, options: Options) -> Running:
     """Use `mj_step`; options are attributes of `<option>`, and `hard` for stiff contacts."""
     settings = {k: v for k, v in options.items() if k not in ("dt", "hard")}
-    model = mujoco.MjModel.from_xml_string(make_xml(scene, options["dt"], settings, "hard" in options))
+    model = mujoco.MjModel.from_xml_string(
+        make_xml(scene, options["dt"], settings, "hard" in options)
+    )
     data = mujoco.MjData(model)
     velocity, forces, control = get_start(scene)
     ids = [model.body(f"b{i}").id for i in range(len(forces))]
@@ -27,7 +29,8 @@ def build(scene: Scene, options: Options) -> Running:
     def state() -> list[Any]:
         for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
             update(model, data)
-        rows, v = [], np.zeros(6)
+        rows = []
+        v = np.zeros(6)
         for i in ids:
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, i, v, 0)
             rows.append([*data.xpos[i], *data.xquat[i], *v[3:], *v[:3]])
@@ -36,7 +39,8 @@ def build(scene: Scene, options: Options) -> Running:
     def properties() -> list[Any]:
         friction = [model.geom_friction[model.body_geomadr[i], 0] for i in ids]
         return [
-            [model.body_mass[i], *model.body_inertia[i], f, None] for i, f in zip(ids, friction, strict=True)
+            [model.body_mass[i], *model.body_inertia[i], f, None]
+            for i, f in zip(ids, friction, strict=True)
         ]
 
     def residual() -> float | None:

@@ -14,15 +14,20 @@ import sapien  # noqa: E402
 import sapien.physx as px  # noqa: E402
 
 
-# fmt: off
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     """Use `PhysxCpuSystem.step`; options are those of set_body_config and set_scene_config, and `free`: no damping."""
-    dt, moving, bodies, friction = options["dt"], tools.get_moving(scene), [], scene["friction"]
+    dt = options["dt"]
+    moving = tools.get_moving(scene)
+    bodies = []
+    friction = scene["friction"]
     bounce = {k: options[k] for k in ("bounce_threshold",) if k in options}
     px.set_scene_config(gravity=np.array(scene["gravity"], np.float32), **bounce)
-    px.set_body_config(**{k: v for k, v in options.items() if k not in ("dt", "free", "bounce_threshold")})
+    px.set_body_config(
+        **{k: v for k, v in options.items() if k not in ("dt", "free", "bounce_threshold")}
+    )
     system = px.PhysxCpuSystem()
-    world, material = sapien.Scene([system]), px.PhysxMaterial(friction, friction, scene["restitution"])
+    world = sapien.Scene([system])
+    material = px.PhysxMaterial(friction, friction, scene["restitution"])
     system.timestep = dt
 
     def add(component: Any, shape: Any, pose: Any) -> Any:
@@ -40,7 +45,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     ground.add_component(px.PhysxRigidStaticComponent())
     world.add_entity(ground)
     for b in moving:
-        body, half, radius = px.PhysxRigidDynamicComponent(), tools.get_half(b), tools.get_radius(b)
+        body = px.PhysxRigidDynamicComponent()
+        half = tools.get_half(b)
+        radius = tools.get_radius(b)
         sphere = px.PhysxCollisionShapeSphere(radius, material) if radius else None
         shape = sphere or px.PhysxCollisionShapeBox(np.array(half), material)
         add(body, shape, sapien.Pose(b["position"], b["quaternion"]))
@@ -55,11 +62,18 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
             body.set_linear_velocity(b["velocity"])
             body.set_angular_velocity(b["spin"])
         bodies.append(body)
-    turn = [0.5**0.5, 0, 0, 0.5**0.5]  # The x axis of the frame of a joint is the y axis of the world.
+    turn = [
+        0.5**0.5,
+        0,
+        0,
+        0.5**0.5,
+    ]  # The x axis of the frame of a joint is the y axis of the world.
     for joint in scene["joints"]:
         tie = px.PhysxDriveComponent(bodies[joint["b"]])
         tie.set_parent(bodies[joint["a"]] if joint["a"] >= 0 else ground.components[0])
-        tie.set_pose_in_child(sapien.Pose(np.subtract(joint["anchor"], moving[joint["b"]]["position"]), turn))
+        tie.set_pose_in_child(
+            sapien.Pose(np.subtract(joint["anchor"], moving[joint["b"]]["position"]), turn)
+        )
         above = moving[joint["a"]]["position"] if joint["a"] >= 0 else np.zeros(3)
         tie.set_pose_in_parent(sapien.Pose(np.subtract(joint["anchor"], above), turn))
         for limit in (tie.set_limit_x, tie.set_limit_y, tie.set_limit_z, tie.set_limit_cone):
@@ -75,7 +89,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         for body, b in zip(bodies, moving, strict=True):
             if b["kinematic"]:
                 now = body.entity.pose
-                body.set_kinematic_target(sapien.Pose(np.array(now.p) + dt * np.array(b["velocity"]), now.q))
+                body.set_kinematic_target(
+                    sapien.Pose(np.array(now.p) + dt * np.array(b["velocity"]), now.q)
+                )
             elif any(b["force"]):
                 body.add_force_at_point(b["force"], body.entity.pose.p)
         system.step()

@@ -17,7 +17,10 @@ class PlaneScene:
     def __init__(self, scene: Scene) -> None:
         if not scene["planar"]:
             raise CannotExpress("an engine in two dimensions")
-        vectors = [scene["gravity"], *(b[key] for b in get_moving(scene) for key in ("velocity", "force"))]
+        vectors = [
+            scene["gravity"],
+            *(b[key] for b in get_moving(scene) for key in ("velocity", "force")),
+        ]
         size, first = max((math.hypot(*v[:2]), v) for v in vectors)
         self.direction = (first[0] / size, first[1] / size) if size > 0 else (1.0, 0.0)
 
@@ -31,7 +34,8 @@ class PlaneScene:
 
     def lift(self, position: Any, angle: float, velocity: Any, spin: float) -> list[float]:
         """Return the 13 numbers of the state of a body."""
-        (c, s), half = self.direction, -0.5 * angle
+        (c, s) = self.direction
+        half = -0.5 * angle
         x, v = position, velocity
         return [
             c * x[0],

@@ -61,8 +61,13 @@ MUJOCO = (
     Field("impratio", (1.0, 10.0), {}),
     Field("noslip_iterations", (0, 3, 10), {}),
 )
-CONVERGED_OPTIONS = {"solver": "Newton", "iterations": 300, "tolerance": 0.0, "ls_iterations": 100,
-                     "ls_tolerance": 1e-4}  # fmt: skip
+CONVERGED_OPTIONS = {
+    "solver": "Newton",
+    "iterations": 300,
+    "tolerance": 0.0,
+    "ls_iterations": 100,
+    "ls_tolerance": 1e-4,
+}
 
 
 @dataclass
@@ -72,7 +77,9 @@ class Progress:
     watch: Callable[[Event], None] | None  # Called at the beginning of each measurement.
     done: int = 0
     expected: int = 0
-    loads: list[float | None] = field(default_factory=list)  # Number of runnable processes at each timing.
+    loads: list[float | None] = field(
+        default_factory=list
+    )  # Number of runnable processes at each timing.
 
     def begin_measurement(self, kind: str, text: str) -> None:
         """Show the progress before a measurement, "judging" or "timing", which then counts as done."""
@@ -127,8 +134,12 @@ class Stage:
     @classmethod
     def from_stretches_of_runs(cls, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
         """Cut worlds that run with the model's own setting into stretches."""
-        mj, model, starts, controls = runs.mj, runs.model, [], []
-        data, kind = mj.MjData(model), mj.mjtState.mjSTATE_INTEGRATION
+        mj = runs.mj
+        model = runs.model
+        starts = []
+        controls = []
+        data = mj.MjData(model)
+        kind = mj.mjtState.mjSTATE_INTEGRATION
         for world in worlds:
             states = simulate_world(runs, world)[0]
             for state in states:
@@ -144,13 +155,16 @@ class Stage:
             raise InputError(f"{runs.name}: MuJoCo raised an error, {error}") from None
         return configured
 
-    def run_stretches(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    def run_stretches(
+        self, model: Any, states: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Run all stretches.
 
         Returns (seconds of each step, positions of bodies after each stretch (n, bodies, 3) [m]), and stores the state
         before each step in `states`.
         """
-        mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
+        mj = self.mj
+        kind = self.mj.mjtState.mjSTATE_INTEGRATION
         data = mj.MjData(model)
         n, horizon, _ = self.controls.shape
         step_times = np.empty(n * horizon)
@@ -173,7 +187,8 @@ class Stage:
 
         After a part of the stretches with an error above `limit` [m/s], the others are not judged.
         """
-        mj, model = self.mj, setting.apply_to(self.mj, self.model)
+        mj = self.mj
+        model = setting.apply_to(self.mj, self.model)
         never = np.full(1, np.inf)
         result = Measured(setting, str(get_option_value(mj, model, "solver")), never, never, never)
         n, horizon, _ = self.controls.shape
@@ -245,7 +260,9 @@ def list_first_settings(mj: Any, model: Any) -> list[MujocoSetting]:
     mujoco_own = SimpleNamespace(opt=mj.MjOption())
     options = {name: get_option_value(mj, mujoco_own, name) for name in OPTIONS}
     default = replace(MujocoSetting.from_options(mj, model, **options), is_default=True)
-    return list(dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)]))
+    return list(
+        dict.fromkeys([own, default, *(MujocoSetting.from_options(mj, model, **x) for x in tried)])
+    )
 
 
 def list_variants(mj: Any, model: Any, setting: MujocoSetting) -> list[MujocoSetting]:
@@ -254,6 +271,8 @@ def list_variants(mj: Any, model: Any, setting: MujocoSetting) -> list[MujocoSet
     stored = "dense" if mj.mj_isSparse(model) else "sparse"
     tried: list[dict[str, Any]] = [{"jacobian": stored}]
     if options.get("solver", get_option_value(mj, model, "solver")) != "PGS":
-        tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [{"ls_iterations": n} for n in (5, 15, 50)]
+        tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [
+            {"ls_iterations": n} for n in (5, 15, 50)
+        ]
         tried += [{"jacobian": stored, "ls_tolerance": x} for x in (0.1, 1e-3)]
     return [MujocoSetting.from_options(mj, model, **options | x) for x in tried]

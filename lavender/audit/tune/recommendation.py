@@ -40,7 +40,9 @@ class Tuning:
     threshold: float  # Errors [m/s] and distances [m] up to this number count as accurate enough.
     stopped: bool = False  # Whether Ctrl-C stopped the measurement.
     sizes: StepSizes | None = None  # Of the steps of all worlds with the model's own setting.
-    busy: str = ""  # A warning if other processes used the processors during the timing; else empty.
+    busy: str = (
+        ""  # A warning if other processes used the processors during the timing; else empty.
+    )
     # Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     notes: tuple[str, ...] = ()
     n_held_worlds: int = 0
@@ -58,7 +60,11 @@ class Tuning:
     @property
     def _same_problem(self) -> list[Measured]:
         """Timed settings that do not change the problem."""
-        return [m for m in self.measured if not m.setting.changes_problem and np.isfinite(m.mean_step_time)]
+        return [
+            m
+            for m in self.measured
+            if not m.setting.changes_problem and np.isfinite(m.mean_step_time)
+        ]
 
     def _is_accurate_enough(self, m: Measured) -> bool:
         """Return whether a setting's errors and motion do not exceed the present setting's, or the threshold.
@@ -78,7 +84,11 @@ class Tuning:
         """
         now, threshold = self.present_result, self.threshold
         limit = (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time
-        good = [m for m in self._same_problem if m.mean_step_time < limit and self._is_accurate_enough(m)]
+        good = [
+            m
+            for m in self._same_problem
+            if m.mean_step_time < limit and self._is_accurate_enough(m)
+        ]
         good = [m for m in good if m.worst_error <= max(now.worst_error, threshold)]
 
         def rank(m: Measured) -> tuple[float, float, float]:
@@ -103,7 +113,11 @@ class Tuning:
         if self.faster is not None and self.faster.worst_error <= self.threshold:
             return None
         limit = (1.0 + TIME_NOISE_FRACTION) * now.mean_step_time
-        good = [m for m in self._same_problem if m.mean_step_time <= limit and self._is_accurate_enough(m)]
+        good = [
+            m
+            for m in self._same_problem
+            if m.mean_step_time <= limit and self._is_accurate_enough(m)
+        ]
         best = min(good, key=lambda m: m.worst_error)
         return best if best.worst_error < now.worst_error > self.threshold else None
 
@@ -164,10 +178,22 @@ class Tuning:
         """Build the table of some settings."""
         now = self.present_result.mean_step_time
         rows = [
-            (m.setting.short_name, f"{m.mean_step_time / now:.2f}", m.worst_error, float(m.error.max()), m.worst_motion)
+            (
+                m.setting.short_name,
+                f"{m.mean_step_time / now:.2f}",
+                m.worst_error,
+                float(m.error.max()),
+                m.worst_motion,
+            )
             for m in settings
-        ]  # fmt: skip
-        heads = ["setting", "relative time", "error 99 % [m/s]", "largest error [m/s]", "motion [m]"]
+        ]
+        heads = [
+            "setting",
+            "relative time",
+            "error 99 % [m/s]",
+            "largest error [m/s]",
+            "motion [m]",
+        ]
         return pd.DataFrame(rows, columns=heads)
 
     @property
@@ -194,7 +220,9 @@ class Tuning:
     @property
     def headline(self) -> list[str]:
         """The headline: the setting, its gain, the present errors, the results on worlds held back."""
-        now, m, n = self.present_result, self.advised, len(self._same_problem)
+        now = self.present_result
+        m = self.advised
+        n = len(self._same_problem)
         worst = format_speed(self._compute_largest_error(now), limit=self.shown_limit)
         own = (
             f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst {worst}; the limit is "
@@ -203,28 +231,44 @@ class Tuning:
         if self.reason_without_line:
             return [self.reason_without_line, own]
         if m is None:
-            return [f"Keep the model's own setting: none of {n} settings is better in the same time.", own]
+            return [
+                f"Keep the model's own setting: none of {n} settings is better in the same time.",
+                own,
+            ]
         ratio = m.mean_step_time / now.mean_step_time
         is_same = abs(ratio - 1.0) <= TIME_NOISE_FRACTION
         time = "the same time per step" if is_same else f"{ratio:.2f} of the time per step"
         new, old = (format_speed(self._compute_largest_error(x)) for x in (m, now))
-        worst = f"a worst error of {new} instead of {old}" if new != old else f"the same worst error of {new}"
+        worst = (
+            f"a worst error of {new} instead of {old}"
+            if new != old
+            else f"the same worst error of {new}"
+        )
         first = f"Set {m.setting.short_name}: {time}, and {worst}."
         if self.error_limit is not None and self.within_limit is None:
             first = f"None of {n} settings is within the limit. {first}"
         held = self._format_held_back(m)
         if held is None:
             return [first, own]
-        return [first, own, (
-            f"On {format_count(self.n_held_worlds, 'world')} held back from the choice: {held[0]} of the time, worst "
-            f"error {held[1]} in {format_count(len(self.held[0].error), 'step')}."
-        )]  # fmt: skip
+        return [
+            first,
+            own,
+            (
+                f"On {format_count(self.n_held_worlds, 'world')} held back from the choice: "
+                f"{held[0]} of the time, worst "
+                f"error {held[1]} in {format_count(len(self.held[0].error), 'step')}."
+            ),
+        ]
 
     @property
     def choices(self) -> pd.DataFrame:
         """The present setting and the advised ones: option, relative time and errors, also on worlds held back."""
         now = self.present_result
-        named = [("now", now), ("as fast, more accurate", self.closer), ("as accurate, faster", self.faster)]
+        named = [
+            ("now", now),
+            ("as fast, more accurate", self.closer),
+            ("as accurate, faster", self.faster),
+        ]
         if self.error_limit is not None:
             goal = f"fastest within {format_speed(self.error_limit)}"
             named.append((goal if self.within_limit else "most accurate", self.limit_choice))
@@ -236,7 +280,9 @@ class Tuning:
             texts = self._format_held_back(m) or (NONE, NONE)
             time = f"{m.mean_step_time / now.mean_step_time:.2f}"
             worst = format_speed(self._compute_largest_error(m))
-            rows.append((name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts))
+            rows.append(
+                (name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts)
+            )
         heads = ["choice", "option", "time", "1 %", "worst", "time, held back", "worst, held back"]
         return pd.DataFrame(rows, columns=heads)
 
@@ -245,7 +291,9 @@ class Tuning:
         now, limit = self.present_result, self.shown_limit
         low = SHOWN_RATIO * limit
         solvers = list(dict.fromkeys(m.solver for m in self._same_problem))
-        colors = [color for color in drawing.SERIES if color != drawing.ORANGE]  # The limit is orange.
+        colors = [
+            color for color in drawing.SERIES if color != drawing.ORANGE
+        ]  # The limit is orange.
         styles = {solver: (colors[i % 4], "osDv"[i % 4]) for i, solver in enumerate(solvers)}
 
         def place(m: Measured) -> tuple[float, float]:
@@ -255,7 +303,8 @@ class Tuning:
         def fill(axes: Any) -> str:
             points = np.array(list(map(place, self._same_problem)))
             labels = drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
-            low_x, high_x = float(points[:, 0].min()), max(float(np.quantile(points[:, 0], 0.97)), 1.05)
+            low_x = float(points[:, 0].min())
+            high_x = max(float(np.quantile(points[:, 0], 0.97)), 1.05)
             axes.set_xlim(low_x - 0.04, high_x + 0.04)
             axes.axvline(1.0, color=drawing.QUIET, lw=0.7, ls=":")
             for solver, (color, mark) in styles.items():
@@ -278,7 +327,8 @@ class Tuning:
             axes.set_ylabel("error that 1 % of the steps exceed [m/s]")
             drawing.label_ends(axes, labels)
             for i, (solver, (color, mark)) in enumerate(styles.items()):
-                y, style = 0.97 - 0.07 * i, {"transform": axes.transAxes, "clip_on": False}
+                y = 0.97 - 0.07 * i
+                style = {"transform": axes.transAxes, "clip_on": False}
                 axes.plot([1.06], [y], mark, color=color, ms=5, **style)
                 drawing.write_label(axes, 1.1, y, solver, color=color)
             fastest = self.pareto_front[0].mean_step_time / now.mean_step_time
@@ -292,13 +342,16 @@ class Tuning:
     def make_page(self, folder: Path | None) -> Page:
         """Make the page; without a folder for figures, only its head."""
         first, *sentences = self.headline
-        m, worst = self.advised, float(self.present_result.error.max())
+        m = self.advised
+        worst = float(self.present_result.error.max())
         warnings = [*filter(None, self.notes)]
         if self.busy and not self.reason_without_line:
             warnings.append(f"{self.busy} Errors are not affected.")
         blocks: list[Any] = []
         if folder is not None:
-            drawn = [] if self.reason_without_line else [markupsafe.Markup(self.draw_settings(folder))]
+            drawn = (
+                [] if self.reason_without_line else [markupsafe.Markup(self.draw_settings(folder))]
+            )
             note = "" if self.reason_without_line else CHOICES_NOTE
             choices = tabulate_frame(self.choices, title="Choices", note=note)
             blocks.append({"pair": [drawn, [choices]]})
@@ -320,26 +373,48 @@ class Tuning:
         code = [m.setting.option_line] if m is not None and m.setting.option_line else []
         mark = "✗ above the limit now" if is_bad else "✓ within the limit now"
         if self.reason_without_line:
-            mark, is_bad = "✗ too little contact", True
-        return Page("lavender tune", source, first, sentences, code, mark=mark, is_bad=is_bad, warnings=warnings,
-                    blocks=blocks, footer=footer)  # fmt: skip
+            mark = "✗ too little contact"
+            is_bad = True
+        return Page(
+            "lavender tune",
+            source,
+            first,
+            sentences,
+            code,
+            mark=mark,
+            is_bad=is_bad,
+            warnings=warnings,
+            blocks=blocks,
+            footer=footer,
+        )
 
     @property
     def page(self) -> ResultPage:
         """Page with the result in sentences, figures and tables, as `lavender tune` writes it."""
         numbers = {
-            "model": self.model, "head": self.headline, "why_no_line": self.reason_without_line, "busy": self.busy,
+            "model": self.model,
+            "head": self.headline,
+            "why_no_line": self.reason_without_line,
+            "busy": self.busy,
             "error_limit": self.error_limit,
             "is_limit_met": None if self.error_limit is None else self.within_limit is not None,
-            **({} if self.sizes is None else self.sizes.as_dict), "stopped": self.stopped,
-            "measured": list(map(_to_dict, self.measured)), "held": list(map(_to_dict, self.held)),
+            **({} if self.sizes is None else self.sizes.as_dict),
+            "stopped": self.stopped,
+            "measured": list(map(_to_dict, self.measured)),
+            "held": list(map(_to_dict, self.held)),
             "provenance": self.provenance,
-        }  # fmt: skip
+        }
         last = format_provenance(self.provenance) if self.provenance else ""
         return ResultPage(self.make_page, numbers, [self.choices], self.stopped, last)
 
 
 def _to_dict(m: Measured) -> dict[str, Any]:
     """Convert a result to a dict for JSON."""
-    return {"options": dict(m.setting.options), "default": m.setting.is_default, "seconds": m.mean_step_time,
-            "error": m.worst_error, "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip
+    return {
+        "options": dict(m.setting.options),
+        "default": m.setting.is_default,
+        "seconds": m.mean_step_time,
+        "error": m.worst_error,
+        "worst": float(m.error.max()),
+        "motion": m.worst_motion,
+    }

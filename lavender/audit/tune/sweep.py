@@ -40,11 +40,20 @@ TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine
 
 
 def tune(
-    model: Any, *, worlds: int = 16, steps: int = 200, control: Control = "random", seed: int = 0,
-    spread: float | None = None, states: Any = None, horizon: int = 10, repeats: int = 5,
-    threshold: float = DEFAULT_THRESHOLD, max_velocity_error: float | None = None,
+    model: Any,
+    *,
+    worlds: int = 16,
+    steps: int = 200,
+    control: Control = "random",
+    seed: int = 0,
+    spread: float | None = None,
+    states: Any = None,
+    horizon: int = 10,
+    repeats: int = 5,
+    threshold: float = DEFAULT_THRESHOLD,
+    max_velocity_error: float | None = None,
     watch: Callable[[Event], None] | None = None,
-) -> Tuning:  # fmt: skip
+) -> Tuning:
     """Measure settings of MuJoCo on worlds of a model.
 
     Parameters
@@ -79,7 +88,10 @@ def tune(
         MuJoCo does not store the matrix of the integrator "discrete" (see `lavender.io.from_mujoco`).
     """
     worlds = check_int("worlds", worlds, 2, None)
-    horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
+    horizon, repeats = (
+        check_int("horizon", horizon, 1, None),
+        check_int("repeats", repeats, 1, None),
+    )
     threshold = check_float("threshold", threshold, low=0.0)
     if spread is not None:
         check_float("spread", spread, low=0.0)
@@ -87,7 +99,9 @@ def tune(
     if error_limit is not None:
         error_limit = check_float("max_velocity_error", error_limit, low=0.0)
     if check_int("steps", steps, 1, None) % horizon:
-        raise InputError(f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon")
+        raise InputError(
+            f"steps is {steps} and horizon is {horizon}; steps must be a multiple of horizon"
+        )
     runs = Runs.of_model(model, worlds, steps, states=states, control=control, seed=seed)
     # Raise the error of an unsupported model here, before any world is simulated.
     from_mujoco_many(runs.model, np.zeros((0, runs.model.nq + runs.model.nv)))
@@ -96,10 +110,17 @@ def tune(
     with count_engine_warnings(runs.mj):  # Settings with which worlds diverge are left out.
         runs = runs.choose_spread(spread)
         tuning = Tuning(
-            runs.name, horizon, [], [], threshold, notes=runs.notes,
-            n_held_worlds=worlds // 2, error_limit=error_limit, held_errors={},
+            runs.name,
+            horizon,
+            [],
+            [],
+            threshold,
+            notes=runs.notes,
+            n_held_worlds=worlds // 2,
+            error_limit=error_limit,
+            held_errors={},
             provenance=describe_provenance(runs.model, runs.name),
-        )  # fmt: skip
+        )
         progress = Progress(watch)
         try:
             _measure_settings(tuning, runs, repeats, progress)
@@ -108,7 +129,9 @@ def tune(
                 raise
             tuning.stopped = True
     tuning.measured = [m for m in tuning.measured if np.isfinite(m.mean_step_time)]
-    tuning.busy = machine.make_busy_warning(progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+    tuning.busy = machine.make_busy_warning(
+        progress.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE
+    )
     return tuning
 
 
@@ -117,9 +140,11 @@ def _measure_settings(tuning: Tuning, runs: Runs, repeats: int, progress: Progre
     measured, held_errors, error_limit = tuning.measured, tuning.held_errors, tuning.error_limit
     halves = [range(i, runs.worlds, 2) for i in (0, 1)]
     stage, held_back = (Stage.from_stretches_of_runs(runs, half, tuning.horizon) for half in halves)
-    own, first_settings = MujocoSetting(), list_first_settings(runs.mj, runs.model)
+    own = MujocoSetting()
+    first_settings = list_first_settings(runs.mj, runs.model)
     n_variants = len(list_variants(runs.mj, runs.model, own)) * EXPECTED_VARIED_SETTINGS
-    n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
+    n_first = len(first_settings)
+    n_trial = min(N_TRIAL_ROUNDS, repeats)
     # Three settings on the worlds held back, each timed in twice as many rounds.
     n_held = 3 * (1 + 2 * repeats)
     progress.expected = n_first * (1 + n_trial + repeats) + n_variants * (1 + repeats) + n_held
@@ -131,7 +156,9 @@ def _measure_settings(tuning: Tuning, runs: Runs, repeats: int, progress: Progre
         )
     held = held_back.judge_settings([own], progress)
     both = [*measured, *held]
-    rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
+    rows, contacts = (
+        np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts")
+    )
     tuning.sizes = StepSizes(rows, contacts, can_any_geoms_collide(runs.mj, runs.model))
     if not tuning.sizes.has_enough_contact:
         progress.expected = repeats

@@ -23,11 +23,31 @@ from lavender.sim.engine.state import State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
 GIVEN = (
-    "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution", "patch", "joint", "inv_mass",
-    "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies", "joint_body", "excluded",
-)  # fmt: skip
+    "inv_mass_body",
+    "inertia",
+    "inv_inertia_body",
+    "shape",
+    "friction",
+    "restitution",
+    "patch",
+    "joint",
+    "inv_mass",
+    "kind_of_shape",
+    "dyn",
+    "uneven",
+    "body_of",
+    "joint_kind",
+    "joint_motor",
+    "joint_bodies",
+    "joint_body",
+    "excluded",
+)
 FIXED_HEAD = ("position_iterations", "order", "seed", "friction_shape")
-WRITTEN_SETTINGS = {"out": 8, "depth": 1, "joint_error": 1}  # Entries of `setting` that the engine writes.
+WRITTEN_SETTINGS = {
+    "out": 8,
+    "depth": 1,
+    "joint_error": 1,
+}  # Entries of `setting` that the engine writes.
 # Largest accepted deviation of a squared quaternion norm from 1 [-]; quaternions are normalised in every substep.
 QUATERNION_TOLERANCE = 1e-9
 
@@ -85,15 +105,22 @@ def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
 
 def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
     """Check the counters and the settings in `head`."""
-    n, top = int(own.size[SIZE["bodies"]]), 2**31 - 1
+    n = int(own.size[SIZE["bodies"]])
+    top = 2**31 - 1
     contacts = int(new.size[CAP_CONTACT])
     per = int(own.size[SIZE["rows_per_contact"]])
-    counters = dict.fromkeys(("step", "need_pairs", "need_contacts", "rebuilds", "projected"), (0, top))
+    counters = dict.fromkeys(
+        ("step", "need_pairs", "need_contacts", "rebuilds", "projected"), (0, top)
+    )
     ranges = {
-        **counters, **dict.fromkeys(("contacts", "matches", "cached"), (0, contacts)),
-        **dict.fromkeys(("pairs_valid", "warm_start", "solved"), (0, 1)), "contact_rows": (0, contacts * per),
-        "pairs": (0, int(new.size[CAP_PAIR])), "iterations": sweeps, "lost": (0, n - 1) if is_lost else (-1, -1),
-    }  # fmt: skip
+        **counters,
+        **dict.fromkeys(("contacts", "matches", "cached"), (0, contacts)),
+        **dict.fromkeys(("pairs_valid", "warm_start", "solved"), (0, 1)),
+        "contact_rows": (0, contacts * per),
+        "pairs": (0, int(new.size[CAP_PAIR])),
+        "iterations": sweeps,
+        "lost": (0, n - 1) if is_lost else (-1, -1),
+    }
     for name, (low, high) in ranges.items():
         value = new.head[HEAD[name]]
         require_intact(low <= value <= high, f"{name} is {value}, not {low} to {high}")
@@ -118,18 +145,25 @@ def _check_contacts(new: State) -> None:
     friction = b["mu"][kj : kj + c] > 0.0
     box = friction & bool(new.head[HEAD["friction_shape"]])
     max_rows = np.where(box, 3, np.where(friction, 6, 1))
-    has_rows = (blocks >= np.where(friction, 3, 1)).all() and (blocks <= np.minimum(max_rows, per)).all()
+    has_rows = (blocks >= np.where(friction, 3, 1)).all() and (
+        blocks <= np.minimum(max_rows, per)
+    ).all()
     is_valid = has_rows and ptr[0] == mj and ptr[-1] == mj + rows
     require_intact(
-        is_valid, f"ptr does not give each of the {c} contacts the rows of its kind, {rows} in total"
+        is_valid,
+        f"ptr does not give each of the {c} contacts the rows of its kind, {rows} in total",
     )
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     is_box = np.concatenate([np.zeros(kj, bool), box])
     kinds = get_block_kinds(contact, box=is_box, spin=size == 4, rolling=size > 4)
-    require_intact(c == 0 or (b["kind"][: kj + c] == kinds).all(), "kind does not match the rows of a block")
+    require_intact(
+        c == 0 or (b["kind"][: kj + c] == kinds).all(), "kind does not match the rows of a block"
+    )
     pair = b["contact_pair"][:c]
-    is_body = ((pair >= 0) & (pair < n)).all() and np.array_equal(b["contact_body"][:c], b["dyn"][pair])
+    is_body = ((pair >= 0) & (pair < n)).all() and np.array_equal(
+        b["contact_body"][:c], b["dyn"][pair]
+    )
     require_intact(c == 0 or is_body, "contact_pair names bodies that the scene does not have")
 
 
@@ -147,8 +181,15 @@ def check_snapshot_fields(snapshot: Any) -> None:
     for name in ("fingerprint", "lost"):
         x = getattr(snapshot, name)
         require_intact(isinstance(x, str), f"{name} is a {type(x).__name__}, not text")
-    for name, dtype in (("size", np.int32), ("real", np.float64), ("index", np.int32), ("keys", np.uint64)):
+    for name, dtype in (
+        ("size", np.int32),
+        ("real", np.float64),
+        ("index", np.int32),
+        ("keys", np.uint64),
+    ):
         x = getattr(snapshot, name)
         is_vector = isinstance(x, np.ndarray) and x.dtype == dtype and x.ndim == 1
         require_intact(is_vector, f"{name} is not a vector of {np.dtype(dtype).name}")
-    require_intact(len(snapshot.size) == N_SIZES, f"size has {len(snapshot.size)} entries, not {N_SIZES}")
+    require_intact(
+        len(snapshot.size) == N_SIZES, f"size has {len(snapshot.size)} entries, not {N_SIZES}"
+    )

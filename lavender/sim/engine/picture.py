@@ -27,7 +27,10 @@ AWAY = np.array([-np.sin(TURN) * np.cos(TILT), np.cos(TURN) * np.cos(TILT), -np.
 TOP = np.cross(RIGHT, AWAY)
 VIEW = np.stack([RIGHT, TOP], axis=1)
 LIGHT = np.array([-0.45, -0.62, 0.64])
-COLORS = np.array([[122, 95, 181], [79, 124, 172], [91, 146, 121], [181, 137, 95], [168, 95, 122]]) / 255.0
+COLORS = (
+    np.array([[122, 95, 181], [79, 124, 172], [91, 146, 121], [181, 137, 95], [168, 95, 122]])
+    / 255.0
+)
 
 
 class Film:
@@ -37,11 +40,15 @@ class Film:
         require_packages("a film", "matplotlib")
         a = simulation.state.a
         self._bodies = list(zip(a["kind_of_shape"].tolist(), a["shape"].copy(), strict=True))
-        self._joints: list[tuple[int, FloatArray]] = []  # A body, and the joint's anchor in its frame [m].
+        self._joints: list[
+            tuple[int, FloatArray]
+        ] = []  # A body, and the joint's anchor in its frame [m].
         for (body_a, body_b), joint in zip(a["joint_bodies"].tolist(), a["joint"], strict=True):
             at = JOINT["anchor_b" if body_b >= 0 else "anchor_a"]
             self._joints.append((body_b if body_b >= 0 else body_a, joint[at : at + 3].copy()))
-        self._frames = [(simulation.time, a["x"].reshape(-1, 3).copy(), a["q"].reshape(-1, 4).copy())]
+        self._frames = [
+            (simulation.time, a["x"].reshape(-1, 3).copy(), a["q"].reshape(-1, 4).copy())
+        ]
 
     def add(self, time: float, positions: FloatArray, quaternions: FloatArray) -> None:
         """Add the poses (n, 3) [m] and (n, 4) at `time` [s] if they are finite and the next frame is due."""
@@ -55,7 +62,9 @@ class Film:
         from matplotlib.figure import Figure
         from PIL import Image
 
-        radii = [float(np.linalg.norm(shape[:3])) for kind, shape in self._bodies if kind >= SPHERE] or [1.0]
+        radii = [
+            float(np.linalg.norm(shape[:3])) for kind, shape in self._bodies if kind >= SPHERE
+        ] or [1.0]
         solid = [i for i, (kind, _) in enumerate(self._bodies) if kind >= SPHERE] or [0]
         centres = np.stack([x[solid] @ VIEW for _, x, _ in self._frames])
         low, high = ((centres + s * np.array(radii)[:, None]) for s in (-1, 1))
@@ -68,13 +77,18 @@ class Film:
             for time, x, q in self._frames:
                 axes.clear()
                 axes.set_axis_off()
-                axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", title=f"{time:.2f} s")
+                axes.set(
+                    xlim=(left, right), ylim=(bottom, top), aspect="equal", title=f"{time:.2f} s"
+                )
                 self._draw(axes, x, q)
                 canvas.draw()
                 yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
-        images, options = draw_frames(), {"save_all": True, "duration": 1000 // FRAME_RATE, "loop": 0}
-        write_atomically(path, lambda part: next(images).save(part, "GIF", append_images=images, **options))
+        images = draw_frames()
+        options = {"save_all": True, "duration": 1000 // FRAME_RATE, "loop": 0}
+        write_atomically(
+            path, lambda part: next(images).save(part, "GIF", append_images=images, **options)
+        )
 
     def _draw(self, axes: Any, x: FloatArray, q: FloatArray) -> None:
         """Draw boxes and spheres, horizontal planes as a line, and joints as lines from a body to the anchor."""
@@ -86,17 +100,25 @@ class Film:
                 axes.axhline(shape[3] * TOP[2], color="0.6", lw=0.8, zorder=-1e9)
             elif kind == SPHERE:
                 ball = Circle(
-                    tuple(x[i] @ VIEW), shape[0], fc=color, ec="k", lw=0.5, zorder=-float(x[i] @ AWAY)
+                    tuple(x[i] @ VIEW),
+                    shape[0],
+                    fc=color,
+                    ec="k",
+                    lw=0.5,
+                    zorder=-float(x[i] @ AWAY),
                 )
                 axes.add_patch(ball)
             elif kind == BOX:
                 axis_vectors = convert_to_rotation_matrix(q[i]).T * shape[:3, None]
                 for k, sign in product(range(3), (-1.0, 1.0)):
-                    face, u, v = sign * axis_vectors[k], axis_vectors[k - 1], axis_vectors[k - 2]
+                    face = sign * axis_vectors[k]
+                    u = axis_vectors[k - 1]
+                    v = axis_vectors[k - 2]
                     if face @ AWAY < 0.0:
                         points = x[i] + face + np.stack([u + v, u - v, -u - v, v - u])
                         fill = color * (0.6 + 0.4 * (face @ LIGHT) / shape[k])
-                        outline, depth = points @ VIEW, -float((points @ AWAY).mean())
+                        outline = points @ VIEW
+                        depth = -float((points @ AWAY).mean())
                         axes.add_patch(Polygon(outline, fc=fill, ec="k", lw=0.5, zorder=depth))
         for i, anchor in self._joints:
             line = np.stack([x[i], x[i] + convert_to_rotation_matrix(q[i]) @ anchor]) @ VIEW

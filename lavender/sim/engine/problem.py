@@ -30,25 +30,38 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
     c = int(state.head[HEAD["contacts"]])
-    k, m = kj + c, mj + int(state.head[HEAD["contact_rows"]])
+    k = kj + c
+    m = mj + int(state.head[HEAD["contact_rows"]])
     normal = a["normal"][:c].copy()
     tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
     # Contacts without friction have no tangent; `Rows` needs a unit vector orthogonal to the normal.
     for i in np.flatnonzero(a["mu"][kj:k] == 0.0):
         side = np.cross(normal[i], np.eye(3)[np.argmin(np.abs(normal[i]))])
         size = compute_norm(side)
-        tangent[i] = side / size if size > 0.0 else 0.0  # For a zero normal, `Rows` raises the error.
+        tangent[i] = (
+            side / size if size > 0.0 else 0.0
+        )  # For a zero normal, `Rows` raises the error.
     rows = Rows(
-        **{name: a[name].copy() for name in ("inv_mass", "inv_inertia", "v_free", "jac", "joint_body")},
+        **{
+            name: a[name].copy()
+            for name in ("inv_mass", "inv_inertia", "v_free", "jac", "joint_body")
+        },
         **{name: a[name][:c].copy() for name in ("arm_a", "arm_b", "contact_body")},
-        joint_ptr=a["ptr"][: kj + 1].copy(), normal=normal, tangent=tangent, copy=False,
-    )  # fmt: skip
-    lower, upper = np.full(m, -np.inf), np.full(m, np.inf)
+        joint_ptr=a["ptr"][: kj + 1].copy(),
+        normal=normal,
+        tangent=tangent,
+        copy=False,
+    )
+    lower = np.full(m, -np.inf)
+    upper = np.full(m, np.inf)
     lower[:mj], upper[:mj] = a["lower"][:mj], a["upper"][:mj]
     cones = Cones(
-        **{name: a[name][:k].copy() for name in ("kind", "mu", "patch_radius")}, lower=lower, upper=upper,
-        ptr=a["ptr"][: k + 1].copy(), rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
-    )  # fmt: skip
+        **{name: a[name][:k].copy() for name in ("kind", "mu", "patch_radius")},
+        lower=lower,
+        upper=upper,
+        ptr=a["ptr"][: k + 1].copy(),
+        rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
+    )
     # Keys of joints are larger than keys of contacts: body numbers have 24 bits, and the pair (2^24 - 1, ...) is
     # unused.
     joint_keys = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
@@ -61,7 +74,10 @@ def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], na
         compliance=a["compliance"][:m].copy(),
         guess=guess,
         key=np.concatenate([joint_keys, a["key"][:c]]),
-        names=[*joints, *(f"{bodies[j]} on {bodies[i]}, point {number}" for (i, j), number in pairs)],
+        names=[
+            *joints,
+            *(f"{bodies[j]} on {bodies[i]}, point {number}" for (i, j), number in pairs),
+        ],
         name=name,
         copy=False,
     )
@@ -72,7 +88,9 @@ def _number_contact_points(key: np.ndarray) -> list[int]:
     order = np.argsort(key)
     pair = key[order] >> np.uint64(16)
     position = np.arange(len(key))
-    first = np.maximum.accumulate(np.where(np.append(True, pair[1:] != pair[:-1])[: len(key)], position, 0))
+    first = np.maximum.accumulate(
+        np.where(np.append(True, pair[1:] != pair[:-1])[: len(key)], position, 0)
+    )
     number = np.empty(len(key), np.int64)
     number[order] = 1 + position - first
     return list(number.tolist())
@@ -82,19 +100,28 @@ def summarise_residual(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
     """Return the values of `Simulation.residual` for impulses (m,) [N s]."""
     result = residual(problem, impulse)
     return {
-        "relative": result.relative, "energy": result.energy, "velocity": result.velocity,
-        "floor": result.roundoff_floor, "worst": result.worst_name,
+        "relative": result.relative,
+        "energy": result.energy,
+        "velocity": result.velocity,
+        "floor": result.roundoff_floor,
+        "worst": result.worst_name,
         "share": _compute_energy_fractions(problem, result),
-    }  # fmt: skip
+    }
 
 
-def summarise_motion(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
+def summarise_motion(
+    problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]
+) -> dict[str, Any]:
     """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies."""
     error = motion.motion_error(problem, impulse)
     body = moving_bodies[error.body] if error.body >= 0 else ""
     return {
-        "relative": error.relative, "kinetic": error.kinetic, "speed": error.speed, "spin": error.spin, "body": body
-    }  # fmt: skip
+        "relative": error.relative,
+        "kinetic": error.kinetic,
+        "speed": error.speed,
+        "spin": error.spin,
+        "body": body,
+    }
 
 
 def _compute_energy_fractions(problem: Problem, result: Residual) -> dict[str, float]:
@@ -117,5 +144,11 @@ def _compute_energy_fractions(problem: Problem, result: Residual) -> dict[str, f
     energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
     total = float(energy.sum())
     names = RESIDUAL_PARTS if c.has_rolling else RESIDUAL_PARTS[:4]
-    sums = np.bincount(part, weights=energy, minlength=len(names)) if problem.m else np.zeros(len(names))
-    return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(names, sums, strict=True)}
+    sums = (
+        np.bincount(part, weights=energy, minlength=len(names))
+        if problem.m
+        else np.zeros(len(names))
+    )
+    return {
+        name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(names, sums, strict=True)
+    }

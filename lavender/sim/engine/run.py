@@ -83,7 +83,8 @@ class Trace:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
 
-        path, content = check_figure_path(path), io.BytesIO()
+        path = check_figure_path(path)
+        content = io.BytesIO()
         canvas = Figure(figsize=(8, 7), layout="constrained")
         top, middle, bottom = canvas.subplots(3, 1, sharex=True)
         for name, label in (
@@ -93,7 +94,10 @@ class Trace:
             value = self.column(name)
             top.semilogy(self.time, np.where(value > 0.0, value, np.nan), label=label)
         top.set(title=f"{self.title}: residual of the normals", ylabel="max $|e_n|$ [N s]")
-        for name, label, width in (("contacts", "contacts", 5.0), ("cache_matches", "matches", 1.5)):
+        for name, label, width in (
+            ("contacts", "contacts", 5.0),
+            ("cache_matches", "matches", 1.5),
+        ):
             middle.plot(self.time, self.column(name), linewidth=width, label=label)
         middle.set(title="contacts, and those found in the cache", ylim=(0, None))
         for axes in (top, middle):
@@ -149,8 +153,13 @@ def run(
     """
     steps = check_int("steps", steps, 1)
     recorded = 0
-    solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
-    lost, done, stopped = "", 0, False
+    solver = np.zeros((steps, 8))
+    depth = np.zeros(steps)
+    cost = np.zeros(steps)
+    time = np.zeros(steps)
+    lost = ""
+    done = 0
+    stopped = False
     folder = None if record is None else prepare_step_folder(record, replace)
     try:
         while done < steps and not lost:
@@ -178,9 +187,18 @@ def run(
     title = f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
     title += f"{'warm' if simulation.warm_start else 'cold'}, {method}"
     return Trace(
-        repr(scene), time[:done], solver[:done], depth[:done], cost[:done], lost_body=lost, recorded=recorded,
-        title=title, order=order, method=method, stopped=stopped,
-    )  # fmt: skip
+        repr(scene),
+        time[:done],
+        solver[:done],
+        depth[:done],
+        cost[:done],
+        lost_body=lost,
+        recorded=recorded,
+        title=title,
+        order=order,
+        method=method,
+        stopped=stopped,
+    )
 
 
 def format_step(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:

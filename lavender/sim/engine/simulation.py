@@ -12,7 +12,12 @@ from lavender.base.arrays import check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.io.stored import prepare_step_folder
 from lavender.problem import Problem
-from lavender.sim.engine.check import check_snapshot_fields, check_state, check_state_sizes, require_intact
+from lavender.sim.engine.check import (
+    check_snapshot_fields,
+    check_state,
+    check_state_sizes,
+    require_intact,
+)
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.state import State
@@ -148,7 +153,8 @@ class Simulation(Stepping):
         check_name("form", form, ("npz", "fclib"))
         steps = check_int("steps", steps, 1)
         folder = Path(folder)
-        digits, written = len(str(self._steps + steps)), []
+        digits = len(str(self._steps + steps))
+        written = []
         prepare_step_folder(folder, continued=folder.resolve() == self._recorded)
         self._recorded = folder.resolve()
         for _ in range(steps):
@@ -214,7 +220,10 @@ class Simulation(Stepping):
             steps=self._steps,
             failed=self._failed,
             lost=self._find_lost_body(),
-            **{name: mark_read_only(getattr(s, name).copy()) for name in ("size", "real", "index", "keys")},
+            **{
+                name: mark_read_only(getattr(s, name).copy())
+                for name in ("size", "real", "index", "keys")
+            },
         )
 
     @run_exclusively
@@ -228,7 +237,9 @@ class Simulation(Stepping):
             simulation is unchanged.
         """
         if not isinstance(snapshot, Snapshot):
-            raise InputError(f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed: sim.snapshot()")
+            raise InputError(
+                f"snapshot is a {type(snapshot).__name__}; a Snapshot is needed: sim.snapshot()"
+            )
         if snapshot.fingerprint != self._fingerprint:
             raise InputError(
                 "the snapshot belongs to another scene, because bodies, joints or parameters differ; a "
@@ -247,9 +258,11 @@ class Simulation(Stepping):
         check_state(self.state, state, self._sweeps, bool(lost))
         is_lost_body = not lost or lost == self._names[state.head[HEAD["lost"]]]
         require_intact(is_lost_body, f"{lost[:40]!r} is not the body with the lost state")
-        self.state, self._restored = state, True
+        self.state = state
+        self._restored = True
         self._steps, self._failed = snapshot.steps, snapshot.failed
-        self._last, self._end_reason = None, ""
+        self._last = None
+        self._end_reason = ""
         self._find_lost_body()
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -262,7 +275,9 @@ class Simulation(Stepping):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy or pickle as a new simulation that continues from the same state."""
-        make = partial(Simulation, report_residual=self.report_residual, report_motion=self.report_motion)
+        make = partial(
+            Simulation, report_residual=self.report_residual, report_motion=self.report_motion
+        )
         return make, (self.scene,), self.snapshot()
 
     def __setstate__(self, snapshot: Snapshot) -> None:

@@ -58,7 +58,9 @@ class Snapshot:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the snapshot to a file with version and checksum; an existing file is replaced atomically."""
-        arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
+        arrays = [
+            np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS
+        ]
         header = {name: getattr(self, name) for name in HEADER_FIELDS}
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
         head = json.dumps({"version": VERSION, **header, "lengths": lengths_of}).encode()
@@ -115,6 +117,8 @@ class Snapshot:
         snapshot = cls(**{name: header[name] for name in HEADER_FIELDS} | arrays)
         check_snapshot_fields(snapshot)
         used = compute_buffer_lengths(snapshot.size)
-        if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
+        if end != len(body) or [max(n, 1) for n in used] != [
+            max(n, 1) for n in header["lengths"][1:]
+        ]:
             raise ValueError("lengths")
         return snapshot

@@ -44,10 +44,16 @@ MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are reje
 class ObservationViews(NamedTuple):
     """Functions that copy the arrays of an observation, for given numbers of contacts and of contact rows."""
 
-    arrays: dict[str, Copy]  # mapping of str to callable: copies of the arrays of an observation, by name.
-    contacts: dict[str, Copy]  # mapping of str to callable: copies of the arrays of its contacts, by name.
+    arrays: dict[
+        str, Copy
+    ]  # mapping of str to callable: copies of the arrays of an observation, by name.
+    contacts: dict[
+        str, Copy
+    ]  # mapping of str to callable: copies of the arrays of its contacts, by name.
     gap: np.ndarray  # (c,) m
-    impulses: Copy | None  # Copy of the contact impulses; None if contacts have different numbers of rows.
+    impulses: (
+        Copy | None
+    )  # Copy of the contact impulses; None if contacts have different numbers of rows.
     per: int  # Largest number of rows of a contact of this scene.
 
 
@@ -82,16 +88,25 @@ class State:
     def get_observation_views(self, contacts: int, rows: int) -> ObservationViews:
         """Return the copy functions of an observation; they are cached while the numbers do not change."""
         if self._views is None or self._views[:2] != (contacts, rows):
-            a, first = self.a, int(self.size[SIZE["joint_rows"]])
+            a = self.a
+            first = int(self.size[SIZE["joint_rows"]])
             per = int(self.size[SIZE["rows_per_contact"]])
             even = rows == contacts * per
             block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
             out = self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues)
             array_of = {"positions": "x", "quaternions": "q", "velocities": "v"}
             array_of["joint_impulses"] = "joint_impulse"
-            each = {"pair": "contact_pair", "point": "point", "normal": "normal", "tangent": "tangent"}
+            each = {
+                "pair": "contact_pair",
+                "point": "point",
+                "normal": "normal",
+                "tangent": "tangent",
+            }
             views = ObservationViews(
-                arrays={**{name: a[array].copy for name, array in array_of.items()}, "solver": out.copy},
+                arrays={
+                    **{name: a[array].copy for name, array in array_of.items()},
+                    "solver": out.copy,
+                },
                 contacts={name: a[array][:contacts].copy for name, array in each.items()},
                 gap=a["gap"][:contacts],
                 impulses=block,
@@ -139,18 +154,25 @@ class State:
         uneven = [not b.is_static and not same for b, same in zip(bodies, even, strict=True)]
         frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
         mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
-        patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
-        restitution = np.array([p.restitution if b.restitution is None else b.restitution for b in bodies])
+        patch = np.array(
+            [p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies]
+        )
+        restitution = np.array(
+            [p.restitution if b.restitution is None else b.restitution for b in bodies]
+        )
         shaped = np.array([b.shape is not None for b in bodies], bool)
         rough = bool((mu[shaped] > 0.0).any())
-        spin, rolling = rough and bool((patch[shaped] > 0.0).any()), rough and p.rolling_radius > 0.0
+        spin = rough and bool((patch[shaped] > 0.0).any())
+        rolling = rough and p.rolling_radius > 0.0
         per = 1 + 2 * rough + spin + 2 * rolling
         if p.friction_shape == "box" and (spin or rolling):
             raise InputError(
                 "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has neither torsional nor "
                 "rolling friction; leave one of the two out"
             )
-        excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
+        excluded = sorted(
+            {tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0}
+        )
         n_shapes = int(shaped.sum())
         size = np.zeros(N_SIZES, np.int32)
         size[SIZE["bodies"]] = n
@@ -181,9 +203,16 @@ def _put_parameters(state: State, p: Parameters) -> None:
     head, setting = state.head, state.setting
     setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
     numbers = {
-        "h": p.dt / p.substeps, "slop": p.slop, "margin": p.margin, "skin": 5.0 * p.margin, "beta": BETA,
-        "max_push": MAX_PUSH, "bounce": p.restitution_threshold, "match": 5.0 * p.margin, "rolling": p.rolling_radius,
-    }  # fmt: skip
+        "h": p.dt / p.substeps,
+        "slop": p.slop,
+        "margin": p.margin,
+        "skin": 5.0 * p.margin,
+        "beta": BETA,
+        "max_push": MAX_PUSH,
+        "bounce": p.restitution_threshold,
+        "match": 5.0 * p.margin,
+        "rolling": p.rolling_radius,
+    }
     for name, x in numbers.items():
         setting[SETTING[name]] = x
     head[HEAD["iterations"]] = p.solver_iterations
@@ -213,11 +242,14 @@ def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool
             a["uneven"][i] = uneven[i]
             dynamic += 1
         if isinstance(b.shape, Plane):
-            a["kind_of_shape"][i], a["shape"][i] = PLANE, [*b.shape.normal, b.shape.offset]
+            a["kind_of_shape"][i] = PLANE
+            a["shape"][i] = [*b.shape.normal, b.shape.offset]
         elif isinstance(b.shape, Sphere):
-            a["kind_of_shape"][i], a["shape"][i, :3] = SPHERE, b.shape.radius
+            a["kind_of_shape"][i] = SPHERE
+            a["shape"][i, :3] = b.shape.radius
         elif isinstance(b.shape, Box):
-            a["kind_of_shape"][i], a["shape"][i, :3] = BOX, 0.5 * np.array(b.shape.size)
+            a["kind_of_shape"][i] = BOX
+            a["shape"][i, :3] = 0.5 * np.array(b.shape.size)
         else:
             a["kind_of_shape"][i] = NO_SHAPE
 
@@ -233,8 +265,10 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.compute_norm(side)  # pyright: ignore[reportArgumentType]
         for name in ("length", "hertz", "damping"):
             values[JOINT[name]] = getattr(j, name)
-        values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
-        a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
+        values[JOINT["speed"]] = j.motor_speed or 0.0
+        values[JOINT["torque"]] = j.motor_torque
+        a["joint_kind"][i] = JOINT_KINDS[j.kind]
+        a["joint_motor"][i] = j.motor_speed is not None
         a["joint_bodies"][i] = j.a, j.b
         a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
         row += j.n_rows

@@ -31,9 +31,13 @@ from lavender_ext.engine.arrays import NEED_CAPACITY, OK
 
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # Default tolerance of lavender.solve.
-INSIDE_STEP = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+INSIDE_STEP = (
+    "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+)
 SIMULATION_CLOSED = "this simulation is closed"
-SUBSTEPS_PER_CALL = 256  # A compiled call does up to this many substeps; Ctrl-C is checked between calls.
+SUBSTEPS_PER_CALL = (
+    256  # A compiled call does up to this many substeps; Ctrl-C is checked between calls.
+)
 INCOMPLETE_STEP = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # The counter of substeps in `head` restarts from 0 after this number.
 P = ParamSpec("P")
@@ -66,15 +70,20 @@ class Stepping:
         if isinstance(scene, str):
             scene = Scene(scene)
         if not isinstance(scene, Scene):
-            raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
+            raise InputError(
+                f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name"
+            )
         if not scene.bodies:
             raise InputError(
                 "the scene has no bodies; at least one is needed: add some with add_box, add_sphere or add_plane"
             )
-        self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
+        self.scene = scene = copy(
+            scene
+        )  # Later additions to the scene do not change this simulation.
         self.report_residual = check_flag("report_residual", report_residual)
         self.report_motion = check_flag("report_motion", report_motion)
-        self._lock, self._refusal = RLock(), ""  # `_refusal` is the reason why calls are rejected, or empty.
+        self._lock = RLock()
+        self._refusal = ""  # `_refusal` is the reason why calls are rejected, or empty.
         self._load_scene(scene)
 
     def _load_scene(self, scene: Scene) -> None:
@@ -89,7 +98,11 @@ class Stepping:
         # If `newton` has no option but the tolerance, its first phase runs on the engine's own arrays.
         tol = p.solver_options.get("tol", TOL)
         self._warm_tol = 0.0
-        if p.solver == "newton" and set(p.solver_options) <= {"tol"} and isinstance(tol, (int, float)):
+        if (
+            p.solver == "newton"
+            and set(p.solver_options) <= {"tol"}
+            and isinstance(tol, (int, float))
+        ):
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
         self._order = get_sweep_order(p)
         self._steps = 0
@@ -153,7 +166,9 @@ class Stepping:
         self.state.head[HEAD["warm_start"]] = check_flag("warm_start", flag)
 
     @run_exclusively
-    def set_velocity(self, body: int | str, velocity: Any = None, angular_velocity: Any = None) -> None:
+    def set_velocity(
+        self, body: int | str, velocity: Any = None, angular_velocity: Any = None
+    ) -> None:
         """Set the velocity with which a body enters the next step, for example to apply an impact.
 
         The results of the last step (observation, residual, solution, contact cache) do not change. A snapshot
@@ -188,8 +203,13 @@ class Stepping:
         i = check_int("body", body, 0, len(self._names) - 1)
         name = self._names[i]
         if self.state.a["dyn"][i] < 0:
-            raise InputError(f"{name} is static, so its velocity cannot be set: choose a dynamic body")
-        parts = ((0, "velocity", velocity, "m/s"), (3, "angular_velocity", angular_velocity, "rad/s"))
+            raise InputError(
+                f"{name} is static, so its velocity cannot be set: choose a dynamic body"
+            )
+        parts = (
+            (0, "velocity", velocity, "m/s"),
+            (3, "angular_velocity", angular_velocity, "rad/s"),
+        )
         values = [
             (first, as_array(f"{quantity} of {name}", x, (3,), unit=unit))
             for first, quantity, x, unit in parts
@@ -254,7 +274,9 @@ class Stepping:
             The simulation has terminated (reset it or restore a snapshot), or is closed.
         """
         if action is not None:
-            raise InputError(f"action is {action!r}; this simulation has no actions, and None is needed")
+            raise InputError(
+                f"action is {action!r}; this simulation has no actions, and None is needed"
+            )
         with self._lock:
             if self._refusal:
                 raise LavenderError(self._refusal)
@@ -273,8 +295,10 @@ class Stepping:
 
     def _advance_all_substeps(self) -> None:
         """Do all substeps of a step; restore the state before the step if one of them raises."""
-        substeps, first = self._parameters.substeps, self.state
-        first_substep, failed = first.head.item(HEAD["step"]), self._failed
+        substeps = self._parameters.substeps
+        first = self.state
+        first_substep = first.head.item(HEAD["step"])
+        failed = self._failed
         # A registered solver may raise or be interrupted in any substep; the state before the step is then restored
         # from a copy. A single substep needs no copy: it changes the state only after its solve.
         needs_copy = substeps > 1 and not self._own_sweeps
@@ -336,7 +360,9 @@ class Stepping:
             self.prepare_substep()
             kernel, a = self.state.kernel, self.state.a
             kernel.solve(False)
-            rows = self.state.size.item(SIZE["joint_rows"]) + self.state.head.item(HEAD["contact_rows"])
+            rows = self.state.size.item(SIZE["joint_rows"]) + self.state.head.item(
+                HEAD["contact_rows"]
+            )
             if rows and warm:
                 # Run the first phase of `newton` on the engine's arrays. The impulses are bit for bit the result of
                 # lavender.solve(problem, "newton"), without building the problem.
@@ -367,7 +393,13 @@ class Stepping:
         options = dict(self._parameters.solver_options)
         options.pop("tol", None)
         run = FinishedRun(
-            problem, get("newton"), options, impulse, claim, tol=self._warm_tol, solve_time=solve_time
+            problem,
+            get("newton"),
+            options,
+            impulse,
+            claim,
+            tol=self._warm_tol,
+            solve_time=solve_time,
         )
         return finish(run)
 
@@ -398,7 +430,9 @@ class Stepping:
         s = self.state
         c = s.head.item(HEAD["contacts"])
         views = s.get_observation_views(c, s.head.item(HEAD["contact_rows"]))
-        observation: dict[str, Any] = {name: copy_array() for name, copy_array in views.arrays.items()}
+        observation: dict[str, Any] = {
+            name: copy_array() for name, copy_array in views.arrays.items()
+        }
         contacts = {name: copy_array() for name, copy_array in views.contacts.items()}
         contacts["depth"] = 0.0 - views.gap
         observation["contacts"] = contacts
@@ -406,9 +440,11 @@ class Stepping:
             contacts["impulses"] = views.impulses()
             return observation
         # Contacts have different numbers of rows; missing rows are zero.
-        a, kj = s.a, int(s.size[SIZE["joints"]])
+        a = s.a
+        kj = int(s.size[SIZE["joints"]])
         contacts["impulses"] = out = np.zeros((c, views.per))
-        first, end = a["ptr"][kj : kj + c], a["ptr"][kj + 1 : kj + c + 1]
+        first = a["ptr"][kj : kj + c]
+        end = a["ptr"][kj + 1 : kj + c + 1]
         for row in range(views.per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
@@ -449,7 +485,9 @@ class Stepping:
 
     def _summarise_motion_error(self) -> dict[str, Any]:
         problem, impulse = self._rebuild_last_problem()
-        return summarise_motion(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
+        return summarise_motion(
+            problem, impulse, [b.name for b in self.scene.bodies if not b.is_static]
+        )
 
     def _rebuild_last_problem(self) -> tuple[Problem, FloatArray]:
         """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""

@@ -8,9 +8,15 @@ import numpy as np
 #: contacts, number of contacts with an entry in the cache, max |e_n| [N s] before the first and after the last sweep,
 #: max(0, -w_n) [m/s] before the first and after the last sweep.
 SOLVER_FIELDS = (
-    "iterations", "warm_start", "contacts", "cache_matches", "residual_initial", "residual_final", "violation_initial",
+    "iterations",
+    "warm_start",
+    "contacts",
+    "cache_matches",
+    "residual_initial",
+    "residual_final",
+    "violation_initial",
     "violation_final",
-)  # fmt: skip
+)
 SOLVER_UNITS = ("", "", "", "", "N s", "N s", "m/s", "m/s")
 
 

@@ -35,7 +35,8 @@ def compute_sine_and_cosine(angle: float) -> tuple[float, float]:
     x = (numerator << FIXED_POINT_BITS) // denominator
     quarter, x = divmod(2 * x + PI // 2, PI)  # The new x is 2 (x + pi / 4), in [0, pi).
     x = (x - PI // 2) // 2
-    square, one = (x * x) >> FIXED_POINT_BITS, 1 << FIXED_POINT_BITS
+    square = (x * x) >> FIXED_POINT_BITS
+    one = 1 << FIXED_POINT_BITS
     sine, cosine, a, b = x, one, x, one
     for k in range(1, 64):  # The last term is below (pi / 4)^127 / 127! < 2^-700.
         b = -((b * square) >> FIXED_POINT_BITS) // ((2 * k - 1) * 2 * k)
@@ -68,7 +69,9 @@ def invert_definite_3x3(x: FloatArray) -> FloatArray:
     l21 = reduced / pivot
     last = (f - l20 * c) - l21 * reduced
     # Entries of L^-1 below its unit diagonal.
-    m10, m20, m21 = -l10, l10 * l21 - l20, -l21
+    m10 = -l10
+    m20 = l10 * l21 - l20
+    m21 = -l21
     i22 = 1.0 / last
     i21 = m21 / last
     i20 = m20 / last

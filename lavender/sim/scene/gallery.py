@@ -39,7 +39,9 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
 
 
 @named_scene()
-def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, gap: float = 0.05) -> None:
+def pyramid(
+    scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, gap: float = 0.05
+) -> None:
     """Build a pyramid of rows of boxes, each one box shorter than the row below.
 
     The contacts are coupled in two directions, and their rows are redundant. A base of 10 boxes gives 55 boxes and 400
@@ -47,7 +49,8 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
     their size.
     """
     check_int("base", base, 1)
-    size, pitch = check_float("size", size, above=0.0), size * (1.0 + check_float("gap", gap, low=0.0))
+    size = check_float("size", size, above=0.0)
+    pitch = size * (1.0 + check_float("gap", gap, low=0.0))
     scene.add_plane()
     for row in range(base):
         for i in range(base - row):
@@ -86,7 +89,9 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
 
 
 @named_scene()
-def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, walls: bool = True) -> None:
+def pile(
+    scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, walls: bool = True
+) -> None:
     """Drop `n` bodies into a bin, which gives many irregular, moving contacts.
 
     `kind` is "spheres", "boxes" or "mixed". 1,000 spheres have about 2,500 contacts after they have settled. `seed`
@@ -117,7 +122,9 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
 
 
 @named_scene()
-def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2) -> None:
+def chain(
+    scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2
+) -> None:
     """Build a chain of `n` links on ball joints, with a last link of mass `tip_mass`.
 
     The scene has 3 n joint rows and no contacts. Against the order, one sweep propagates an impulse by one link.
@@ -131,7 +138,8 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
     before = -1
     for i in range(n):
         thick = 0.2 * length if i < n - 1 else 0.4 * length
-        size, mass = (thick, thick, 0.9 * length), tip_mass if i == n - 1 else 1.0
+        size = (thick, thick, 0.9 * length)
+        mass = tip_mass if i == n - 1 else 1.0
         place = (i + 0.5) * length * down
         link = scene.add_box(size, mass, position=place, quaternion=turn, name=f"link {i}")
         scene.add_joint("ball", before, link, anchor=i * length * down)
@@ -180,7 +188,8 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
     pitch = 0.8
     scene.add_plane()
     for i in range(legs):
-        x, y = (i % side - 0.5 * (side - 1)) * pitch, (i // side - 0.5 * (side - 1)) * pitch
+        x = (i % side - 0.5 * (side - 1)) * pitch
+        y = (i // side - 0.5 * (side - 1)) * pitch
         scene.add_box((0.2, 0.2, 1.0), 1.0, position=(x, y, 0.5), name=f"leg {i}")
     edge = side * pitch
     scene.add_box((edge, edge, 0.2), top_mass, position=(0.0, 0.0, 1.1), name="top")
@@ -193,7 +202,8 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
     The box sticks if tan(angle) is smaller than the friction coefficient mu. Otherwise it slides with the acceleration
     g (sin(angle) - mu cos(angle)). The scene has 2 bodies and 4 contacts.
     """
-    angle, size = check_float("angle", angle, low=-1.5, high=1.5), check_float("size", size, above=0.0)
+    angle = check_float("angle", angle, low=-1.5, high=1.5)
+    size = check_float("size", size, above=0.0)
     turn = make_quaternion((0.0, 1.0, 0.0), angle)
     normal = convert_to_rotation_matrix(turn)[:, 2]
     scene.add_plane(normal, 0.0)
@@ -213,7 +223,9 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
 
 
 @named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
-def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6, gap: float = 0.01) -> None:
+def newtons_cradle(
+    scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6, gap: float = 0.01
+) -> None:
     """Build Newton's cradle of `n` balls on strings, of which `lifted` are released from the angle `angle`.
 
     The impacts follow one another, and the energy must not increase. The strings have 2 n rows. `gap` separates the
@@ -226,13 +238,19 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
     for i in range(n):
         pivot = np.array([(i - 0.5 * (n - 1)) * (2.0 * radius + gap), 0.0, 3.0])
         s, c = compute_sine_and_cosine(-angle if i < lifted else 0.0)
-        ball = scene.add_sphere(radius, position=pivot + drop * np.array([s, 0.0, -c]), name=f"ball {i}")
+        ball = scene.add_sphere(
+            radius, position=pivot + drop * np.array([s, 0.0, -c]), name=f"ball {i}"
+        )
         for side in (-1.0, 1.0):
-            scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * half_spread, 0.0]))
+            scene.add_joint(
+                "distance", -1, ball, anchor_a=pivot + np.array([0.0, side * half_spread, 0.0])
+            )
 
 
 @named_scene()
-def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, tilt: float = 0.4) -> None:
+def four_bar(
+    scene: Scene, motor: float | None = None, torque: float = 200.0, tilt: float = 0.4
+) -> None:
     """Build a closed loop of three bars and the ground on four oblique hinges, with redundant rows.
 
     The 3 bodies have 18 degrees of freedom and 20 joint rows (21 with a motor), but one degree of freedom remains.
@@ -251,7 +269,11 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
         # The bars are offset along the axis, so that they do not overlap.
         position = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         name = ("crank", "coupler", "rocker")[i]
-        bars.append(scene.add_box((long, 0.1, 0.1), long, position=position, quaternion=q, name=name))
+        bars.append(
+            scene.add_box((long, 0.1, 0.1), long, position=position, quaternion=q, name=name)
+        )
     for i, (a, b) in enumerate(zip([-1, *bars], [*bars, -1], strict=True)):
-        drive: dict[str, Any] = {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
+        drive: dict[str, Any] = (
+            {} if motor is None or i else {"motor_speed": motor, "motor_torque": torque}
+        )
         scene.add_joint("hinge", a, b, anchor=corner[i], axis=axis, **drive)

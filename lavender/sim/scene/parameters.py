@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import check_bool, check_float, check_int, check_nonnegative_magnitudes, get_shape
+from lavender.base.arrays import (
+    check_bool,
+    check_float,
+    check_int,
+    check_nonnegative_magnitudes,
+    get_shape,
+)
 from lavender.base.errors import InputError, check_name
 from lavender.problem.friction import SHAPES
 from lavender.problem.ordering import ENGINE_ORDERS
@@ -21,10 +27,14 @@ SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")
 ON_FAILURE = ("use", "keep", "damp", "raise")
 #: Ranges of the numeric parameters.
 PARAMETER_RANGES: dict[str, dict[str, float]] = {
-    "dt": {"above": 0.0}, "restitution": {"low": 0.0, "high": 1.0},
-    **{key: {"low": 0.0} for key in ("friction", "patch_radius", "rolling_radius", "slop", "margin")},
+    "dt": {"above": 0.0},
+    "restitution": {"low": 0.0, "high": 1.0},
+    **{
+        key: {"low": 0.0}
+        for key in ("friction", "patch_radius", "rolling_radius", "slop", "margin")
+    },
     "restitution_threshold": {"low": 0.0},
-}  # fmt: skip
+}
 # Largest number of substeps that is computed from `max_substep`; more must be given as `substeps`.
 MAX_DEFAULT_SUBSTEPS = 10_000
 MIN_SWEEPS, MAX_SWEEPS = 4, 64  # Range of `solver_iterations` of sequential impulses.
@@ -120,7 +130,8 @@ class Parameters:
             raise InputError(f"solver_options is {self.solver_options!r}; a mapping is needed")
         put(self, "solver_options", dict(self.solver_options))
         own = self.solver == "sequential_impulses"
-        spec, sweeps = get(self.solver), self.solver_iterations
+        spec = get(self.solver)
+        sweeps = self.solver_iterations
         if own and self.solver_options:
             raise InputError(
                 f"solver_options are {sorted(self.solver_options)}, but the solver is sequential_impulses, "
@@ -128,7 +139,9 @@ class Parameters:
             )
         if sweeps is None:
             sweeps = 16 if own else spec.max_iter
-        sweeps = check_int("solver_iterations", sweeps, *((MIN_SWEEPS, MAX_SWEEPS) if own else (1,)))
+        sweeps = check_int(
+            "solver_iterations", sweeps, *((MIN_SWEEPS, MAX_SWEEPS) if own else (1,))
+        )
         put(self, "solver_iterations", sweeps)
         max_substep: Any = self.max_substep
         if max_substep is None:
@@ -136,7 +149,9 @@ class Parameters:
         put(self, "max_substep", check_float("max_substep", max_substep, above=0.0))
         substeps: Any = self.substeps
         if substeps is None:  # Choose the smallest number that respects `max_substep`.
-            ratio = self.dt / self.max_substep - 1e-9  # Rounding of an integer ratio must not add a substep.
+            ratio = (
+                self.dt / self.max_substep - 1e-9
+            )  # Rounding of an integer ratio must not add a substep.
             if ratio > MAX_DEFAULT_SUBSTEPS:
                 raise InputError(
                     f"dt is {self.dt:g} s, more than {MAX_DEFAULT_SUBSTEPS} substeps of max_substep = "
@@ -154,7 +169,11 @@ class Parameters:
                 f"{self.solver!r}: leave order out, or give solver_options of {self.solver!r}"
             )
         check_name("friction_shape", self.friction_shape, SHAPES)
-        put(self, "position_iterations", check_int("position_iterations", self.position_iterations, 0, 1000))
+        put(
+            self,
+            "position_iterations",
+            check_int("position_iterations", self.position_iterations, 0, 1000),
+        )
         put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
 

@@ -71,7 +71,9 @@ class Box:
     def __post_init__(self) -> None:
         edges = check_numbers("size of a box [m]", self.size, 3)
         if not (edges > 0.0).all():
-            raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
+            raise InputError(
+                f"size of a box is {edges.tolist()} m; three positive edges are needed"
+            )
         _put(self, "size", tuple(edges.tolist()))
 
     def compute_inertia(self, mass: float) -> FloatArray:
@@ -226,9 +228,12 @@ def choose_inertia(label: str, inertia: Any, shape: Any, mass: float) -> FloatAr
             x = np.asarray((shape if shape is not None else Sphere(0.1)).compute_inertia(mass))
         quantity = f"inertia of {label}, of mass {mass:g} kg and {shape or 'radius 0.1 m'},"
     else:
-        x, quantity = _check_inertia_tensor(label, inertia), f"inertia of {label}"
+        x = _check_inertia_tensor(label, inertia)
+        quantity = f"inertia of {label}"
     moments = np.linalg.eigvalsh(x) if np.isfinite(x).all() else x
-    if not mass >= MIN_MAGNITUDE or not np.all((moments >= MIN_MAGNITUDE) & (moments <= MAX_MAGNITUDE)):
+    if not mass >= MIN_MAGNITUDE or not np.all(
+        (moments >= MIN_MAGNITUDE) & (moments <= MAX_MAGNITUDE)
+    ):
         raise InputError(
             f"{quantity} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {MIN_MAGNITUDE:g} "
             f"to {MAX_MAGNITUDE:g}: use other units of mass or length"
@@ -240,7 +245,9 @@ def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
     """Convert principal moments (3,) or a tensor to a tensor (3, 3) [kg m^2]; reject inertias that no body has."""
     shape = get_shape(f"inertia of {label}", inertia)
     if shape not in ((3,), (3, 3)):
-        raise InputError(f"inertia of {label} is {inertia!r}; 3 moments or a (3, 3) tensor is needed")
+        raise InputError(
+            f"inertia of {label} is {inertia!r}; 3 moments or a (3, 3) tensor is needed"
+        )
     x = as_array(f"inertia of {label} [kg m^2]", inertia, shape)
     if x.ndim == 1:
         x = np.diag(x)
@@ -252,7 +259,9 @@ def _check_inertia_tensor(label: str, inertia: Any) -> FloatArray:
     x = 0.5 * x + 0.5 * x.T
     value = np.linalg.eigvalsh(x)
     if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
-        raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")
+        raise InputError(
+            f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive"
+        )
     # Every body satisfies I_3 = sum m (x_1^2 + x_2^2) <= I_1 + I_2.
     if value[2] > (1.0 + PLATE_MOMENT_TOLERANCE) * (value[0] + value[1]):
         raise InputError(

@@ -11,7 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_nonnegative_magnitudes
+from lavender.base.arrays import (
+    FloatArray,
+    check_bool,
+    check_float,
+    check_int,
+    check_nonnegative_magnitudes,
+)
 from lavender.base.errors import InputError, UnknownName, check_name
 from lavender.sim.scene import arithmetic
 from lavender.sim.scene.parameters import COMMON_PARAMETERS, Parameters
@@ -78,7 +84,9 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
         name = build.__name__
         first, *own = inspect.signature(build).parameters.values()
         if name in SCENES:
-            raise InputError(f"a scene {name!r} is registered already; give the builder another name")
+            raise InputError(
+                f"a scene {name!r} is registered already; give the builder another name"
+            )
         for p in own:
             if p.name in COMMON_PARAMETERS or p.default is p.empty or p.kind is p.VAR_KEYWORD:
                 raise InputError(
@@ -183,12 +191,21 @@ class Scene:
     # -- bodies ---------------------------------------------------------------------------------
 
     def add_body(
-        self, mass: float = 1.0, inertia: Any = None, *, position: Any = (0.0, 0.0, 0.0),
-        quaternion: Any = (1.0, 0.0, 0.0, 0.0), velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0), static: bool = False, name: str | None = None,
-        friction: float | None = None, restitution: float | None = None, patch_radius: float | None = None,
+        self,
+        mass: float = 1.0,
+        inertia: Any = None,
+        *,
+        position: Any = (0.0, 0.0, 0.0),
+        quaternion: Any = (1.0, 0.0, 0.0, 0.0),
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        static: bool = False,
+        name: str | None = None,
+        friction: float | None = None,
+        restitution: float | None = None,
+        patch_radius: float | None = None,
         shape: Plane | Sphere | Box | None = None,
-    ) -> int:  # fmt: skip
+    ) -> int:
         """Add a body and return its number.
 
         Parameters
@@ -230,11 +247,15 @@ class Scene:
         static = check_bool(f"static of {label}", static) or isinstance(shape, Plane)
         mass = 0.0 if static else check_float(f"mass of {label} [kg]", mass)
         if mass < 0.0 or (mass == 0.0 and not static):
-            raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
+            raise InputError(
+                f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True"
+            )
         q = check_numbers(f"quaternion of {label}", quaternion, 4)
         unit_q = normalise(q, 1e-12)
         if unit_q is None:
-            raise InputError(f"quaternion of {label} is {q.tolist()}; a nonzero quaternion is needed")
+            raise InputError(
+                f"quaternion of {label} is {q.tolist()}; a nonzero quaternion is needed"
+            )
         v = check_numbers(f"velocity of {label} [m/s]", velocity, 3)
         omega = check_numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
         if static and (v.any() or omega.any()):
@@ -249,11 +270,17 @@ class Scene:
             velocity=v,
             angular_velocity=omega,
             friction=_check_optional_number(f"friction of {label}", friction, low=0.0),
-            restitution=_check_optional_number(f"restitution of {label}", restitution, low=0.0, high=1.0),
-            patch_radius=_check_optional_number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+            restitution=_check_optional_number(
+                f"restitution of {label}", restitution, low=0.0, high=1.0
+            ),
+            patch_radius=_check_optional_number(
+                f"patch_radius of {label} [m]", patch_radius, low=0.0
+            ),
         )
         for name in ("friction", "patch_radius"):
-            check_nonnegative_magnitudes(f"{name} of {label}", np.array([getattr(body, name) or 0.0]))
+            check_nonnegative_magnitudes(
+                f"{name} of {label}", np.array([getattr(body, name) or 0.0])
+            )
         self.bodies.append(body)
         return number
 
@@ -280,11 +307,23 @@ class Scene:
     # -- joints ---------------------------------------------------------------------------------
 
     def add_joint(
-        self, kind: str, a: int, b: int, *, anchor: Any = None, anchor_a: Any = None, anchor_b: Any = None,
-        axis: Any = None, length: float | None = None, hertz: float = 0.0, damping: float = 1.0,
-        motor_speed: float | None = None, motor_torque: float | None = None, collide: bool = False,
+        self,
+        kind: str,
+        a: int,
+        b: int,
+        *,
+        anchor: Any = None,
+        anchor_a: Any = None,
+        anchor_b: Any = None,
+        axis: Any = None,
+        length: float | None = None,
+        hertz: float = 0.0,
+        damping: float = 1.0,
+        motor_speed: float | None = None,
+        motor_torque: float | None = None,
+        collide: bool = False,
         name: str | None = None,
-    ) -> int:  # fmt: skip
+    ) -> int:
         """Add a joint between bodies a and b in their present poses and return its number.
 
         Parameters
@@ -315,7 +354,10 @@ class Scene:
         """
         check_name("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
-        a, b = (check_int(f"body of {label} (-1: the world)", body, -1, self.n_bodies - 1) for body in (a, b))
+        a, b = (
+            check_int(f"body of {label} (-1: the world)", body, -1, self.n_bodies - 1)
+            for body in (a, b)
+        )
         if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
             raise InputError(
                 f"{label} joins {a} and {b}; two bodies, at least one of them dynamic, are needed"
@@ -334,7 +376,9 @@ class Scene:
         if (axis is None) == (kind == HINGE):
             raise InputError(f"{label}: axis= is needed for a hinge, and only for a hinge")
         world_axis = (
-            check_unit_vector(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
+            check_unit_vector(f"axis of {label}", axis)
+            if kind == HINGE
+            else np.array([0.0, 0.0, 1.0])
         )
         motor = motor_speed is not None, motor_torque is not None
         if any(motor) and not (all(motor) and kind == HINGE):
@@ -354,7 +398,9 @@ class Scene:
             hertz=check_float(f"hertz of {label}", hertz, low=0.0),
             damping=check_float(f"damping of {label}", damping, low=0.0),
             motor_speed=_check_optional_number(f"motor_speed of {label} [rad/s]", motor_speed),
-            motor_torque=_check_optional_number(f"motor_torque of {label} [N m]", motor_torque, low=0.0)
+            motor_torque=_check_optional_number(
+                f"motor_torque of {label} [N m]", motor_torque, low=0.0
+            )
             or 0.0,
             collide=check_bool(f"collide of {label}", collide),
         )
@@ -362,7 +408,14 @@ class Scene:
         return len(self.joints) - 1
 
     def _check_distance_ends(
-        self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
+        self,
+        label: str,
+        bodies: tuple[int, int],
+        anchor: Any,
+        a: Any,
+        b: Any,
+        length: Any,
+        axis: Any,
     ) -> tuple[FloatArray, FloatArray, float]:
         """Return the anchors (3,) [m] and the length [m] of a distance joint."""
         if anchor is not None or axis is not None:
@@ -379,7 +432,9 @@ class Scene:
         pa, pb = ends
         with np.errstate(over="ignore"):
             distance = arithmetic.compute_norm(pb - pa)
-        length = check_float(f"length of {label} [m]", distance if length is None else length, low=0.0)
+        length = check_float(
+            f"length of {label} [m]", distance if length is None else length, low=0.0
+        )
         if length == 0.0:
             raise InputError(
                 f"{label} has length 0, given or because its anchors coincide; a positive length is needed: "
@@ -404,13 +459,21 @@ class Scene:
         It contains bodies, joints and parameters, without the initial state, the sweep budget and the warm-start mode.
         """
         free = ("solver_iterations", "warm_start")
-        head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
+        head = {
+            f.name: getattr(self.parameters, f.name)
+            for f in fields(Parameters)
+            if f.name not in free
+        }
         parts: list[Any] = [head]
         for b in self.bodies:
             shape = None if b.shape is None else [type(b.shape).__name__, repr(b.shape)]
-            parts.append([b.name, shape, b.mass, b.inertia, b.friction, b.restitution, b.patch_radius])
+            parts.append(
+                [b.name, shape, b.mass, b.inertia, b.friction, b.restitution, b.patch_radius]
+            )
         parts += [[getattr(j, f.name) for f in fields(Joint)] for j in self.joints]
-        text = json.dumps(parts, default=lambda x: x.tolist() if isinstance(x, np.ndarray) else repr(x))
+        text = json.dumps(
+            parts, default=lambda x: x.tolist() if isinstance(x, np.ndarray) else repr(x)
+        )
         return hashlib.sha256(text.encode()).hexdigest()
 
     def __repr__(self) -> str:

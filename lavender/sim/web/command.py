@@ -40,9 +40,13 @@ def web(context: click.Context) -> None:
 
 @web.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT.wasm")
-@click.option("--part", type=click.Choice(["lavender", "newton"]), default="lavender", show_default=True,
-              help="lavender: the independent module; newton: the module for exact solves, loaded in addition to it.",
-)  # fmt: skip
+@click.option(
+    "--part",
+    type=click.Choice(["lavender", "newton"]),
+    default="lavender",
+    show_default=True,
+    help="lavender: the independent module; newton: the module for exact solves, loaded in addition to it.",
+)
 def build(out: Path, part: str) -> None:
     """Compile the kernels to one WebAssembly module.
 

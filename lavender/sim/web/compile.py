@@ -39,8 +39,14 @@ from typing import Any
 
 #: Modules of lavender_ext that the page uses.
 MODULES = (
-    "core.order", "engine.arrays", "engine.substep", "driver.memory", "judge.measure", "sweep.packed", "sweep.pgs",
-)  # fmt: skip
+    "core.order",
+    "engine.arrays",
+    "engine.substep",
+    "driver.memory",
+    "judge.measure",
+    "sweep.packed",
+    "sweep.pgs",
+)
 #: Largest size of a finished module [bytes].
 MAX_MODULE_BYTES = 270_000
 
@@ -56,11 +62,20 @@ class Part:
 #: Modules of the page by name; the first is independent.
 PARTS = {
     "lavender": Part(MODULES),
-    "newton": Part((
-        "core.order", "engine.newton_substep", "factor.linear", "factor.symbolic", "judge.measure", "newton.solve",
-        "newton.warm_start", "sweep.pgs",
-    ), imports_memory=True),
-}  # fmt: skip
+    "newton": Part(
+        (
+            "core.order",
+            "engine.newton_substep",
+            "factor.linear",
+            "factor.symbolic",
+            "judge.measure",
+            "newton.solve",
+            "newton.warm_start",
+            "sweep.pgs",
+        ),
+        imports_memory=True,
+    ),
+}
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, the last section of the file.
 SOURCES_SECTION = "lavender.sources"
@@ -108,9 +123,13 @@ def is_current(path: Path, root: Path, part: Part) -> bool:
 
 
 def build(
-    out: Path, root: Path, modules: Iterable[str | Path] = MODULES, *, max_bytes: int | None = None,
+    out: Path,
+    root: Path,
+    modules: Iterable[str | Path] = MODULES,
+    *,
+    max_bytes: int | None = None,
     imports_memory: bool = False,
-) -> Built:  # fmt: skip
+) -> Built:
     """Build one WebAssembly module from the core functions of several kernel modules.
 
     Parameters
@@ -147,7 +166,11 @@ def build(
         data = _compile_to_wasm(source, names, ["--import-memory"] if imports_memory else [])
     _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
     # A custom section has the number 0 and its length, one byte in LEB128 below 128.
-    section = bytes([len(SOURCES_SECTION)]) + SOURCES_SECTION.encode() + hash_sources(root, modules).encode()
+    section = (
+        bytes([len(SOURCES_SECTION)])
+        + SOURCES_SECTION.encode()
+        + hash_sources(root, modules).encode()
+    )
     data += bytes([0, len(section)]) + section
     try:
         write_atomically(
@@ -168,7 +191,9 @@ def write_atomically(path: Path, data: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
-def _compile_to_wasm(source: Path, names: Iterable[str], extra_options: Iterable[str] = ()) -> bytes:
+def _compile_to_wasm(
+    source: Path, names: Iterable[str], extra_options: Iterable[str] = ()
+) -> bytes:
     """Compile and link one C file without Python headers to a module that exports the functions `names`."""
     compiler, linker, named = _find_tools()
     # Older versions of clang call memset and memcpy; zig uses instructions instead.
@@ -200,11 +225,19 @@ def _find_tools() -> tuple[list[str], list[str], bool]:
 def _run_command(command: list[str], folder: Path) -> None:
     """Run a command in a folder; raise BuildFailed with its output if it fails."""
     env = dict(os.environ)
-    if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # zig caches libraries in the home folder.
+    if not os.access(
+        os.path.expanduser("~"), os.W_OK | os.X_OK
+    ):  # zig caches libraries in the home folder.
         env.setdefault("ZIG_GLOBAL_CACHE_DIR", str(folder / "cache"))
     try:
         done = subprocess.run(
-            command, cwd=folder, env=env, capture_output=True, encoding="utf-8", errors="replace", check=False
+            command,
+            cwd=folder,
+            env=env,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
         )
     except OSError as error:
         raise BuildFailed(f"{command[0]} cannot be run: {error.strerror or error}") from None
@@ -214,17 +247,25 @@ def _run_command(command: list[str], folder: Path) -> None:
 
 def _check_module(module: bytes, max_bytes: int) -> None:
     """Raise BuildFailed if the module has static data or is too large; the linker reports its own errors."""
-    position = 8  # Skip the magic word and the version; number, size and content of each section follow.
+    position = (
+        8  # Skip the magic word and the version; number, size and content of each section follow.
+    )
     while position < len(module):
-        kind, size, shift, position = module[position], 0, 0, position + 1
+        kind = module[position]
+        size = 0
+        shift = 0
+        position = position + 1
         while True:  # Read the section's size, a LEB128 integer.
-            byte, position = module[position], position + 1
+            byte = module[position]
+            position = position + 1
             size |= (byte & 0x7F) << shift
             shift += 7
             if byte < 0x80:
                 break
         if kind == DATA_SECTION_ID:
-            raise BuildFailed(f"a kernel reads static data ({size} bytes), which only Python initialises")
+            raise BuildFailed(
+                f"a kernel reads static data ({size} bytes), which only Python initialises"
+            )
         position += size
     if len(module) >= max_bytes:
         raise BuildFailed(

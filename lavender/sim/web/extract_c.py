@@ -87,8 +87,15 @@ NAME = re.compile(r"(?<![\w.])(?<!->)[A-Za-z_]\w*")
 DIGITS = re.compile(r"\d+")
 #: Words that need no declaration from the kernels: some are defined by the prologue or by the headers.
 PREDEFINED = (
-    "CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT", "inline",
-)  # fmt: skip
+    "CYTHON_INLINE",
+    "CYTHON_UNUSED",
+    "__PYX_EXTERN_C",
+    "likely",
+    "unlikely",
+    "NULL",
+    "DL_IMPORT",
+    "inline",
+)
 OPENING = ("if", "ifdef", "ifndef")
 #: Beginning of a name of Cython: function, type, enum, or the variant of a function with fused types, such as `0_1`.
 MANGLED = re.compile(r"__pyx_(?:[fte]_|fuse_(\d+(?:_\d+)*)__pyx_f_)(?=\d)")
@@ -115,7 +122,8 @@ class Item:
 
 def parse_declarations(text: str, origin: str = "") -> list[Item]:
     """Return the declarations of a C file without comments; those between `#if` and `#endif` form one group."""
-    items, at = [], 0
+    items = []
+    at = 0
     while MARK.search(text, at):
         line = DIRECTIVE_LINE.match(text, at)
         word = _get_directive(line)
@@ -123,9 +131,12 @@ def parse_declarations(text: str, origin: str = "") -> list[Item]:
             end = _find_end_of_group(text, at)
         else:
             end = line.end() if line else _find_end_of_declaration(text, at)
-        part, at = text[at:end].strip(), end
+        part = text[at:end].strip()
+        at = end
         if word in OPENING:
-            inside = DIRECTIVE_LINE.sub(lambda m: m[0] if _get_directive(m) == "define" else "\n", part)
+            inside = DIRECTIVE_LINE.sub(
+                lambda m: m[0] if _get_directive(m) == "define" else "\n", part
+            )
             defines: set[str] = set().union(*(item.defines for item in parse_declarations(inside)))
             items.append(Item("group", part, defines, origin))
         elif word == "define":
@@ -153,7 +164,8 @@ def _find_end_of_group(text: str, at: int) -> int:
 
 def _find_end_of_declaration(text: str, at: int) -> int:
     """Return the position after the declaration that begins at `at`: after the body of a function, or a semicolon."""
-    depth, has_body = 0, False
+    depth = 0
+    has_body = False
     for match in MARK.finditer(text, at):
         mark = match[0]
         if mark == "{" and depth == 0:
@@ -214,7 +226,9 @@ def _add_with_dependencies(
     done[id(item)] = item
 
 
-def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
+def extract_c(
+    translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()
+) -> str:
     """Return one C file without Python.
 
     Parameters
@@ -235,10 +249,14 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
     for module, text in translations:
         # In the C that Cython writes, all declarations are in the #else branch of `#ifndef Py_PYTHON_H`.
         guarded = (
-            text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")[2].rpartition("\n#endif")[0]
+            text.partition("\n#ifndef Py_PYTHON_H\n")[2]
+            .partition("\n#else\n")[2]
+            .rpartition("\n#endif")[0]
         )
         # Words in strings would be renamed, too; no string of a kernel contains such a word.
-        renamed = WORD.sub(lambda word: _make_output_name(word[0], kept_names), _remove_comments(guarded))
+        renamed = WORD.sub(
+            lambda word: _make_output_name(word[0], kept_names), _remove_comments(guarded)
+        )
         for item in parse_declarations(renamed, module):
             for name in item.defines:
                 table.setdefault(name, []).append(item)
@@ -252,7 +270,9 @@ def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: I
     missing = sorted(kept_names - set(table))
     if missing:
         raise ExtractionError(f"no such core functions: {', '.join(missing)}")
-    return "\n\n".join([PROLOGUE, *(_make_static(item, kept_names) for item in reached.values()), front])
+    return "\n\n".join(
+        [PROLOGUE, *(_make_static(item, kept_names) for item in reached.values()), front]
+    )
 
 
 def _remove_comments(text: str) -> str:
@@ -279,7 +299,8 @@ def _make_output_name(name: str, kept_names: frozenset[str]) -> str:
         return "k_" + name[4:] if name.startswith("lav_") and name not in kept_names else name
     mangled = MANGLED.match(name)
     if mangled:
-        at, parts = mangled.end(), []
+        at = mangled.end()
+        parts = []
         while number := DIGITS.match(name, at):
             end = number.end() + int(number[0])
             if end == number.end() or name[end : end + 1] != "_":
@@ -312,7 +333,8 @@ def list_core_functions(root: Path, modules: Iterable[str | Path]) -> list[str]:
 
 def _list_sources(root: Path, module: str | Path) -> set[Path]:
     """Return the files of lavender_ext that the translation of a module reads."""
-    pending, sources = [get_module_path(root, module)], set()
+    pending = [get_module_path(root, module)]
+    sources = set()
     while pending:
         path = pending.pop()
         if path in sources or not path.exists():
@@ -330,7 +352,9 @@ def hash_sources(root: Path, modules: Iterable[str | Path], more: Iterable[Path]
     tools = (root / "lavender_ext" / "build_options.py", Path(__file__))
     digest = hashlib.sha256()
     for path in [*sorted(paths), *tools, *more]:
-        digest.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
+        digest.update(
+            path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0"
+        )
     return digest.hexdigest()
 
 
@@ -359,18 +383,35 @@ def translate_modules_to_c(
     def translate_module(module: str | Path) -> tuple[str, str]:
         source = get_module_path(root, module)
         name = module.stem if isinstance(module, Path) else module
-        cached = cache.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if cache else None
+        cached = (
+            cache.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if cache else None
+        )
         if cached and cached.exists():
             newest = max(path.stat().st_mtime for path in _list_sources(root, module))
             if cached.stat().st_mtime > newest:
                 return name, cached.read_text(encoding="utf-8")
         out = work / f"{name}.c"
         done = subprocess.run(
-            [sys.executable, "-m", "cython", *options, "--shared=lavender_ext._utility", str(source), "-o", str(out)],
-            cwd=root, capture_output=True, encoding="utf-8", errors="replace", check=False,
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "cython",
+                *options,
+                "--shared=lavender_ext._utility",
+                str(source),
+                "-o",
+                str(out),
+            ],
+            cwd=root,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
         if done.returncode:
-            raise ExtractionError(f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}")
+            raise ExtractionError(
+                f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}"
+            )
         return name, out.read_text(encoding="utf-8")
 
     with ThreadPoolExecutor(2) as pool:

@@ -16,7 +16,13 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import check_writable, load_or_make_file, make_folder, write_bytes, write_text
+from lavender.io.stored import (
+    check_writable,
+    load_or_make_file,
+    make_folder,
+    write_bytes,
+    write_text,
+)
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import collect_page_data
 
@@ -35,21 +41,27 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
         raise LavenderError(str(error)) from None
 
 
-def get_or_build_module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
+def get_or_build_module(
+    say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
+) -> bytes:
     """Return a module of the present kernels: the one in the package, or a new one, stored there if possible."""
     shipped = SHIPPED / f"{name}.wasm"
 
     def make() -> bytes:
         if reason := wasm.explain_missing_requirement():
             state = "is of other kernels" if shipped.exists() else "is not in this installation"
-            raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
+            raise LavenderError(
+                f"the WebAssembly module {name} {state} and cannot be built: {reason}"
+            )
         say(f"building the WebAssembly module {name} (about 25 s of CPU time, once)")
         with TemporaryDirectory() as folder:
             out = Path(folder, shipped.name)
             build_module(out, name)
             return out.read_bytes()
 
-    return load_or_make_file(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
+    return load_or_make_file(
+        shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make
+    )
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
@@ -82,7 +94,9 @@ def compare_with_native_kernels(say: Callable[[str], Any] = lambda text: None) -
         )
     node = shutil.which("node")
     if node is None:
-        raise LavenderError("node, which runs the check, is not installed: install Node 18 or newer")
+        raise LavenderError(
+            "node, which runs the check, is not installed: install Node 18 or newer"
+        )
     modules = {name: get_or_build_module(say, name) for name in wasm.PARTS}
     with TemporaryDirectory(prefix="lavender-web-") as folder:
         for name, data in modules.items():

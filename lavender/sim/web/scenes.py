@@ -52,7 +52,9 @@ def describe_snapshot(start: Snapshot) -> dict[str, Any]:
     """
     first = compute_array_offsets(start.size)
     arrays = {}
-    for names, buffer in zip(map(tuple, SHAPES.values()), (start.real, start.index, start.keys), strict=True):
+    for names, buffer in zip(
+        map(tuple, SHAPES.values()), (start.real, start.index, start.keys), strict=True
+    ):
         ends = [*(first[name] for name in names[1:]), len(buffer)]
         for name, end in zip(names, ends, strict=True):
             values = buffer[first[name] : end]
@@ -84,7 +86,9 @@ def write_scene(scene: Scene, path: str | PathLike[str], title: str = "") -> Non
         Name in the list of scenes; the name of the file by default.
     """
     if not isinstance(scene, Scene):
-        raise InputError(f"scene is a {type(scene).__name__}; a Scene is needed: lv.Scene({scene!r:.40})")
+        raise InputError(
+            f"scene is a {type(scene).__name__}; a Scene is needed: lv.Scene({scene!r:.40})"
+        )
     if scene.parameters.solver != "sequential_impulses":
         raise InputError(
             f"the scene uses {scene.parameters.solver!r}, and the page sweeps: pass a scene with the default solver "
@@ -104,5 +108,9 @@ def collect_page_data() -> dict[str, Any]:
     for entry in contents["scenes"]:
         entry |= describe_scene(Scene(entry["name"]))
     for side in (side for preset in contents["presets"] for side in preset["sides"]):
-        side |= {"warm_start": int(side["warm_start"]), "order": ORDER_NUMBER[side["order"]], "box": 0}
+        side |= {
+            "warm_start": int(side["warm_start"]),
+            "order": ORDER_NUMBER[side["order"]],
+            "box": 0,
+        }
     return {"layout": describe_layout(), **contents}

@@ -65,9 +65,11 @@ class AugmentedSystem:
 
     def _build_jacobian(self) -> Any:
         """Build K (m, 6 n) without empty columns, and the positions of the entries of block matrices."""
-        sc, n = self.arrays, self.layout.n
+        sc = self.arrays
+        n = self.layout.n
         panel, _ = compute_body_jacobian(self.problem.metric, self.bodies.pair, self.bodies.column)
-        size, m = np.diff(sc.ptr), sc.m
+        size = np.diff(sc.ptr)
+        m = sc.m
         body = np.repeat(self.layout.body, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)
         row = np.broadcast_to(np.arange(m)[:, None, None], values.shape)
@@ -88,7 +90,9 @@ class AugmentedSystem:
     def _factor(self, left_factor: Any, right: Any, own: Any) -> bool:
         """Factor [[I, -(right K)^T], [left K, own]]; `right` None is the identity."""
         upper = self.k if right is None else right @ self.k
-        matrix = sp.block_array([[sp.eye_array(self.k.shape[1]), -upper.T], [left_factor @ self.k, own]])
+        matrix = sp.block_array(
+            [[sp.eye_array(self.k.shape[1]), -upper.T], [left_factor @ self.k, own]]
+        )
         self.lu = None
         if not np.isfinite(matrix.data).all():
             return False

@@ -24,7 +24,9 @@ FORM = "generalized coordinates"
 # CHECK_INTERVAL [s].
 MAX_STEPS_PER_CHECK = 64
 CHECK_INTERVAL = 4.0
-SPARSE_FLOP_TIME = 1e-9 * RATES["sparse velocities"]  # Time [s] per multiply-add of a sparse factor.
+SPARSE_FLOP_TIME = (
+    1e-9 * RATES["sparse velocities"]
+)  # Time [s] per multiply-add of a sparse factor.
 # Largest number of values of an island's N. 3,000 velocities with a dense N take 144 MB with the factor.
 MAX_MATRIX_ENTRIES = 9e6
 _WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
@@ -64,5 +66,7 @@ def run_newton_steps(
 def make_claim(status: Status, counts: Any) -> Claim:
     """Return the claim for counts of (steps, factorisations, Coulomb rounds, line evaluations)."""
     done, *parts = counts[:4]
-    work = {kind: n for kind, n in zip(_WORK_KINDS, parts, strict=True) if n or kind == _WORK_KINDS[0]}
+    work = {
+        kind: n for kind, n in zip(_WORK_KINDS, parts, strict=True) if n or kind == _WORK_KINDS[0]
+    }
     return Claim(status, done, work, form=FORM)

@@ -65,7 +65,9 @@ def find_bodies(problem: Problem) -> Bodies | None:
     """
     if problem.rows is not None:
         return (
-            Bodies(problem.rows.moving_block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
+            Bodies(problem.rows.moving_block_bodies, problem.rows.n_bodies)
+            if problem.rows.n_bodies
+            else None
         )
     if problem.generalized is None or problem.cones._blocks.has_round:
         return None
@@ -78,7 +80,9 @@ class System:
 
     form = ""
     work = 0.0  # Multiply-adds of one factorisation.
-    factor_seconds = 0.0  # Upper bound of the time of a factorisation [s], on machines of the last ten years.
+    factor_seconds = (
+        0.0  # Upper bound of the time of a factorisation [s], on machines of the last ten years.
+    )
     dense = False  # Whether A is stored as a full matrix.
     entries = 0.0  # Number of entries of A.
     solve: Solve
@@ -94,7 +98,11 @@ class VelocitySystem(System):
         data = problem.metric
         panel, columns = compute_body_jacobian(data, bodies.pair, bodies.column)
         structure = bodies.pair[list_element_blocks(data)], bodies.n, len(columns)
-        reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
+        reused = (
+            like.layout
+            if isinstance(like, VelocitySystem) and like.layout.serves(*structure)
+            else None
+        )
         self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
         self.factor_seconds = 0.5e-9 * self.work
@@ -175,7 +183,8 @@ def run_newton_method(
     is_continued : bool
         Whether to continue a run to the same tol that used up its steps.
     """
-    is_over_velocities, tolerance_ratio = isinstance(method, Driver), 1.0
+    is_over_velocities = isinstance(method, Driver)
+    tolerance_ratio = 1.0
     certificate: FloatArray | None = None
     judged: Any = None
     proven = False
@@ -216,9 +225,12 @@ def run_newton_method(
                     end = MORE if tolerance_ratio > MIN_TOLERANCE_RATIO else STUCK
                     tolerance_ratio *= 0.25
                     begin = [-x for x in count_work()]
-                    last, before = max_iter + begin[0], -1
+                    last = max_iter + begin[0]
+                    before = -1
                     method.start(impulse, tolerance_ratio * tol, UNLIMITED_STEPS)
-            if end != MORE or (max_total is not None and (method.done >= last or method.done == before)):
+            if end != MORE or (
+                max_total is not None and (method.done >= last or method.done == before)
+            ):
                 break
     except KeyboardInterrupt:  # Return the best iterate.
         method.request_stop()

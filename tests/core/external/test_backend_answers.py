@@ -14,7 +14,8 @@ from lavender.external.forms import build_form, choose_program_form, get_program
 @pytest.mark.parametrize("draw", [draw_program, draw_lcp])
 def test_backend_answer_is_at_most_ten_times_worse_than_the_backend_alone(name, draw):
     for seed in range(8):
-        program, is_lcp = draw(seed), draw is draw_lcp
+        program = draw(seed)
+        is_lcp = draw is draw_lcp
         try:
             here, solution = call_here(program, name, is_lcp)
         except lv.CapabilityError:
@@ -29,7 +30,8 @@ def test_backend_started_near_its_answer_needs_at_most_half_of_the_iterations(na
     program = draw_lcp(0) if kind == "lcp" else draw_program(0)
     problem = lv.Problem.lcp(program["P"], -program["q"]) if kind == "lcp" else lv.Problem.from_qp(**program)
     start = lv.solve(problem, "clarabel", tol=1e-9).impulse * (1.0 + 1e-12)
-    cold, warm = lv.solve(problem, name), lv.solve(problem, name, impulse=start)
+    cold = lv.solve(problem, name)
+    warm = lv.solve(problem, name, impulse=start)
     assert warm.success and warm.work.get("iterations", 0) <= cold.work["iterations"] / 2
 
 
@@ -52,7 +54,8 @@ def test_scaled_program_has_numbers_near_one_and_powers_of_two_as_scales(cost, s
 
 def test_backend_form_is_the_named_one_or_that_of_the_problem():
     program = draw_program(0)
-    definite, singular = lv.Problem.from_qp(**program), lv.Problem.from_qp(**draw_program(1))
+    definite = lv.Problem.from_qp(**program)
+    singular = lv.Problem.from_qp(**draw_program(1))
     assert choose_program_form(definite, "auto") == choose_program_form(singular, "auto") == "program"
     for form in ("impulse", "velocity", "program"):
         solution = lv.solve(definite, "clarabel", form=form)

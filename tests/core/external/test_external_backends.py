@@ -49,7 +49,9 @@ def test_backend_prints_nothing_imports_nothing_and_runs_in_threads(name, capfd,
     for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(4))):
         if registry.get(name).refuses(problem) is not None:
             continue
-        alone, finder, before = lv.solve(problem, name), Finder(), (sys.stdout, warnings.filters.copy())
+        alone = lv.solve(problem, name)
+        finder = Finder()
+        before = (sys.stdout, warnings.filters.copy())
         with monkeypatch.context() as patch:
             patch.setattr(sys, "meta_path", [finder, *sys.meta_path])
             lv.solve(problem, name)
@@ -84,7 +86,8 @@ def test_backend_on_a_problem_at_rest_returns_exactly_zero(name, b):
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("linear", [True, False])
 def test_backend_claim_of_infeasibility_has_a_certificate(name, linear):
-    a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
+    a = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    b = np.array([1.0, 1.0])
     problem = lv.Problem.linear(a, b) if linear else lv.Problem.lcp(a, b)
     solution = lv.solve(problem, name, max_iter=500)
     assert not solution.success
@@ -136,7 +139,9 @@ def test_backend_dual_fulfils_the_kkt_conditions(name, form):
     assert solution.success, str(solution)
     assert solution.dual.shape == (problem.m,)
     # The multipliers z of min 1/2 l.A l - b.l satisfy A l - b + z = 0; z > 0 only at an upper bound, z < 0 at a lower.
-    lam, z, speed = solution.impulse, solution.dual, np.abs(problem.b).max()
+    lam = solution.impulse
+    z = solution.dual
+    speed = np.abs(problem.b).max()
     bound = np.where(z > 0.0, cones.upper, cones.lower)
     is_bounded = np.isfinite(bound)
     # 1e-8 relative, times the condition number of this problem (below 100).
@@ -167,7 +172,8 @@ def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
-    calls, run = [], isolated.run_isolated
+    calls = []
+    run = isolated.run_isolated
     monkeypatch.setattr(qp_solver, "run_isolated", lambda *a: calls.append(run(*a)) or calls[-1])
     there = lv.solve(problem, name, time_limit=600.0, isolate=True)
     assert calls
@@ -264,7 +270,8 @@ def test_settings_reach_the_backend_or_are_an_input_error():
 
 def answers(register, *given):
     """osqp gives these, one after the other, the last again and again: an error is raised."""
-    asked, left = [], list(given)
+    asked = []
+    left = list(given)
 
     def call(program, start, limit, extra):
         asked.append(limit)

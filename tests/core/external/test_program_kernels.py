@@ -14,10 +14,13 @@ from lavender_ext.judge.convex import NewtonStep, make_columns, make_dense
 def draw_program(seed, n=9):
     """Return a program with equations, inequalities, lower, upper and equal bounds, in mixed units."""
     rng = np.random.default_rng(seed)
-    half, unit = sp.random(n, n, 0.4, random_state=rng).toarray(), 2.0 ** rng.integers(-6, 7, n)
+    half = sp.random(n, n, 0.4, random_state=rng).toarray()
+    unit = 2.0 ** rng.integers(-6, 7, n)
     P = unit[:, None] * (half @ half.T + np.eye(n)) * unit
-    A, G = rng.normal(size=(2, n)) * unit, sp.random(5, n, 0.5, random_state=rng).toarray() * unit
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    A = rng.normal(size=(2, n)) * unit
+    G = sp.random(5, n, 0.5, random_state=rng).toarray() * unit
+    low = np.full(n, -np.inf)
+    high = np.full(n, np.inf)
     low[:4], high[2:6] = -0.5, 0.5
     low[7] = high[7] = 0.25
     qp = Problem.from_qp(P, rng.normal(size=n) * unit, G, np.ones(5), A, np.zeros(2), low / unit, high / unit).qp
@@ -27,15 +30,18 @@ def draw_program(seed, n=9):
 @pytest.mark.parametrize("seed", range(5))
 def test_newton_step_solves_the_equations_of_active_rows(seed):
     program = draw_program(seed)
-    rng, m = np.random.default_rng(seed), len(program.t)
+    rng = np.random.default_rng(seed)
+    m = len(program.t)
     active = rng.random(m) < 0.3
     active[: program.free] = True
     for i, j in enumerate(program.variable):  # A variable is at one of its bounds.
         active[i] &= j < 0 or not (active[:i] & (program.variable[:i] == j)).any()
-    x, lam = rng.normal(size=9), rng.normal(size=m)
+    x = rng.normal(size=9)
+    lam = rng.normal(size=m)
     scaled = program.scaled
     step = NewtonStep(scaled.P, scaled.q, scaled.J, scaled.t, program.variable, program.scales, active, x, lam)
-    dense, columns = step.make_dense(0.125), sp.csc_array(step.make_columns(0.125), (step.size, step.size))
+    dense = step.make_dense(0.125)
+    columns = sp.csc_array(step.make_columns(0.125), (step.size, step.size))
     np.testing.assert_array_equal(columns.toarray(), dense)
     np.testing.assert_array_equal(dense, dense.T)
     assert columns.has_sorted_indices
@@ -51,7 +57,8 @@ def test_newton_step_solves_the_equations_of_active_rows(seed):
 
 def test_columns_are_the_transposed_selected_rows():
     program = draw_program(3)
-    J, rows = make_dense(program.J, 9), np.array([0, 4, 2], np.int32)
+    J = make_dense(program.J, 9)
+    rows = np.array([0, 4, 2], np.int32)
     np.testing.assert_array_equal(make_dense(program.J, 9, rows, -1.0), -J[rows])
     np.testing.assert_array_equal(sp.csc_array(make_columns(program.J, 9, rows, 2.0), (3, 9)).toarray(), 2.0 * J[rows])
     upper = sp.csc_array(make_columns(program.P, 9, None, 1.0, True), (9, 9)).toarray()
@@ -60,7 +67,8 @@ def test_columns_are_the_transposed_selected_rows():
 
 @pytest.mark.parametrize(("deadline", "largest"), [(NEVER, 20_000), (Deadline(60.0), 20_000), (Deadline(0.04), 300)])
 def test_no_long_step_begins_shortly_before_the_deadline(monkeypatch, deadline, largest):
-    program, sizes = draw_program(0), []
+    program = draw_program(0)
+    sizes = []
     judge = ProgramJudge(program, 1e-6, deadline)
     monkeypatch.setattr(type(program), "polish", lambda self, x, lam, active, size: sizes.append(size))
     judge.accepts(np.zeros(9), np.zeros(len(program.t)))

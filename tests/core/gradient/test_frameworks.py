@@ -11,7 +11,8 @@ def arrays(seed, contacts=2, tangents=2, nv=5):
     """J, M, v*, mu, target and compliance of a step in which some contact slides and some sticks."""
     rng = np.random.default_rng(seed)
     m = contacts * (1 + tangents)
-    jac, root = rng.standard_normal((m, nv)), 0.3 * rng.standard_normal((nv, nv))
+    jac = rng.standard_normal((m, nv))
+    root = 0.3 * rng.standard_normal((nv, nv))
     target = 0.3 * rng.standard_normal(m)
     free = np.linalg.lstsq(jac[:: 1 + tangents], np.full(contacts, -2.0), rcond=None)[0]
     mu, soft = rng.uniform(0.2, 1.0, contacts), rng.uniform(0.05, 0.1, m)

@@ -51,7 +51,8 @@ def test_derivative_jvp_agrees_with_differences_of_solutions(kind, law, operator
 def test_derivative_vjp_is_the_adjoint_of_jvp(kind, law, operator):
     # to rounding: both are the same linear map, read from its two ends
     p = drawn(0, kind, law, operator)
-    d, rng = lv.derivative(p, solved(p)), np.random.default_rng(1)
+    d = lv.derivative(p, solved(p))
+    rng = np.random.default_rng(1)
     weights = {"impulse": rng.standard_normal(p.m), "slack": rng.standard_normal(p.m)}
     if p.matrix is None:
         weights["velocity"] = rng.standard_normal(p.velocity(np.zeros(p.m)).shape)
@@ -89,7 +90,8 @@ def test_derivative_states_fit_impulse_and_slack(kind):
     # the definition, in NumPy: what is open has no impulse, what sticks no slack, what slides is on its rim
     law = "cone" if kind == "round" else "coulomb"
     p = drawn(1, kind, law, "generalized")
-    solution, near = solved(p), 1e-8
+    solution = solved(p)
+    near = 1e-8
     lam, w, c = solution.impulse, solution.slack, p.cones
     for i, state in enumerate(solution.states):
         rows = np.arange(c.ptr[i], c.ptr[i + 1])
@@ -231,7 +233,8 @@ def test_derivative_of_contacts_given_twice_equals_that_of_given_once(law, count
 @pytest.mark.parametrize("kind", ("disk", "normal"))
 def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
     p = drawn(0, kind, "cone" if operator != "asymmetric" else "coulomb", operator, 30)
-    solution, rng = solved(p), np.random.default_rng(0)
+    solution = solved(p)
+    rng = np.random.default_rng(0)
     weights = {"impulse": rng.standard_normal(p.m), "slack": rng.standard_normal(p.m)}
     if p.matrix is None:
         weights["velocity"] = rng.standard_normal(p.velocity(solution.impulse).shape)
@@ -256,17 +259,20 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
 
 def test_gradient_with_reordered_mass_is_unchanged():
     # a hub that stands last fills in: M's factor has velocities in another order
-    rng, n = np.random.default_rng(0), 60
+    rng = np.random.default_rng(0)
+    n = 60
     mass = 4.0 * np.eye(n)
     mass[-1, :-1] = mass[:-1, -1] = 0.2
     mass[-1, -1] = 10.0
-    jac, free = rng.standard_normal((9, n)), rng.standard_normal(n)
+    jac = rng.standard_normal((9, n))
+    free = rng.standard_normal(n)
     given = {"cones": lv.Cones.contacts(np.full(3, 0.5)), "compliance": np.full(9, 0.1)}
     p = lv.Problem.from_jacobian(jac, mass, free, **given)
     turn = np.arange(n)[::-1]
     q = lv.Problem.from_jacobian(jac[:, turn], mass[turn][:, turn], free[turn], **given)
     assert p.generalized.order is not None and q.generalized.order is None
-    y, c = rng.standard_normal(n), rng.standard_normal(9)
+    y = rng.standard_normal(n)
+    c = rng.standard_normal(9)
     one = lv.derivative(p, solved(p)).vjp(velocity=y, impulse=c)
     two = lv.derivative(q, solved(q)).vjp(velocity=y[turn], impulse=c)
     for name, back in (("v_free", turn), ("target", slice(None)), ("mu", slice(None))):
@@ -280,7 +286,8 @@ def test_derivative_by_one_of_several_redundant_rows_raises():
     """A box that slides on four corners: raise one, and it stands on three; which ones depends on the sign."""
     at = [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
     jac = np.array([np.r_[d, np.cross(r, d)] for r in at for d in np.eye(3)[[2, 0, 1]]])
-    mass, free = np.diag([1.0, 1.0, 1.0, 1 / 6, 1 / 6, 1 / 6]), [1.0, 0.3, -0.1, 0.0, 0.0, 0.0]
+    mass = np.diag([1.0, 1.0, 1.0, 1 / 6, 1 / 6, 1 / 6])
+    free = [1.0, 0.3, -0.1, 0.0, 0.0, 0.0]
     p = lv.Problem.from_jacobian(jac, mass, free, cones=lv.Cones.contacts(0.5, count=4))
     d = lv.derivative(p, lv.solve(p, tol=1e-13))
     g = d.vjp(velocity=np.eye(6)[0])

@@ -46,7 +46,8 @@ def test_packed_sweeps_of_any_length_have_the_bits_of_plain_ones(order, kind, co
 @pytest.mark.parametrize(("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")])
 def test_packed_pairs_in_single_sweeps_have_the_bits_of_plain_ones(order, name, options, contacts, joints, kind):
     problem = tangled(contacts, contacts, joints, kind=kind)
-    is_named, rng = order != "array", np.random.default_rng(contacts)
+    is_named = order != "array"
+    rng = np.random.default_rng(contacts)
     if not is_named:
         order = np.concatenate([rng.permutation(joints), joints + rng.permutation(contacts)])
     for counts in ([1, 3, 20, 5, 70], [7]):
@@ -85,7 +86,8 @@ def test_packed_workspace_is_reused_for_a_new_problem():
     problem = tangled(3, 120, 10)
     prepared = lv.prepare(problem, "sequential_impulses")
     prepared.solve(tol=0.0, max_iter=20)
-    state, start = prepared.state, np.zeros(problem.m)
+    state = prepared.state
+    start = np.zeros(problem.m)
     prepared.solve(replace(problem, b=problem.b + 0.01), tol=0.0, max_iter=20)
     # what was there before goes on one by one
     assert state.sweeps.records == (0, 0)

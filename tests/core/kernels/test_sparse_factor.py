@@ -49,7 +49,8 @@ def test_dense_factor_solves_and_counts_lost_pivots(n):
     Backward errors |a x - b| / (|a| |x|) are n roundings, at rank n / 2 as many times more as the last pivot is small.
     """
     rng = np.random.default_rng(n)
-    half, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    half = rng.normal(size=(n, n))
+    b = rng.normal(size=n)
     a = half @ half.T + np.eye(n)
     wide, narrow = (LinearSystem(n, lanes) for lanes in (True, False))
     assert wide.factor(a, a.diagonal(), 0.0, 1e-13) == narrow.factor(a, a.diagonal(), 0.0, 1e-13) == 0
@@ -154,7 +155,8 @@ def test_sparse_factor_solves_with_the_same_bits_in_all_lanes(seed, n, block, lu
     a = sp.csr_array(scale @ a @ scale)
     a.sort_indices()
     assert has_symmetric_pattern(*raw(a))
-    d, b = a.diagonal(), rng.normal(size=n)
+    d = a.diagonal()
+    b = rng.normal(size=n)
     found = []
     for wide in (True, False):
         f = LinearSystem(raw(a), wide)
@@ -210,7 +212,8 @@ def test_sparse_factor_without_pivots_or_digits_is_replaced_by_superlu(diagonal,
     a = sp.csr_array(sp.diags_array(chain, offsets=[-1, 0, 1]))
     a.sort_indices()
     r = np.random.default_rng(0).normal(size=n)
-    alone, system = LinearSystem(raw(a)), LinearSystem(raw(a), True, splu)
+    alone = LinearSystem(raw(a))
+    system = LinearSystem(raw(a), True, splu)
     assert (alone.factor(a.data, tiny=1e-13, lu=True) > 0) == loses_pivots
     assert system.factor(a.data, tiny=1e-13, lu=True) == 0 and system.uses_fallback == loses_pivots
     x = system.solve(r, True)
@@ -236,7 +239,8 @@ def test_symmetric_pattern_of_an_asymmetric_matrix_is_false():
 def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
     """The grid takes 7e8 multiply-adds, and signals are checked after every 2e8: the handler runs inside the call."""
     n = 24
-    line, one = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), sp.eye_array(n)
+    line = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+    one = sp.eye_array(n)
     grid = sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
     a = sp.csr_array(grid)
     a.sort_indices()
@@ -266,7 +270,8 @@ def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
 @pytest.mark.parametrize("is_sparse", [False, True])
 @pytest.mark.parametrize("seed", range(6))
 def test_factor_has_the_sign_of_the_determinant_and_counts_infinite_pivots_as_lost(seed, is_sparse):
-    rng, n = np.random.default_rng(seed), 7 + seed
+    rng = np.random.default_rng(seed)
+    n = 7 + seed
     pattern = mirrored(rng, n, 2, 0.6) if is_sparse else sp.csr_array(rng.normal(size=(n, n)))
     a = pattern.toarray()
     system = LinearSystem(raw(pattern), True) if is_sparse else LinearSystem(n, True)

@@ -26,7 +26,8 @@ def project(law, y, components):
     out = y.copy()
     out[0] = max(L(0.0), y[0])
     for rows, coefficient in components:
-        size, bound = np.sqrt(np.sum(y[rows] ** 2)), coefficient * out[0]
+        size = np.sqrt(np.sum(y[rows] ** 2))
+        bound = coefficient * out[0]
         if size > bound:
             out[rows] *= bound / size
     return out
@@ -44,7 +45,8 @@ def difference(function, x, i):
 def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
     if (kind, law) == ("round", "coulomb"):
         return
-    rng, n = np.random.default_rng(5), 100
+    rng = np.random.default_rng(5)
+    n = 100
     mu, arm = rng.uniform(0.05, 1.5, n), rng.uniform(0.05, 1.5, n)
     mu[::15] = 0.0
     cones = KINDS[kind](mu, arm)
@@ -54,23 +56,28 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
     problem = lv.Problem(rng.standard_normal(m), cones, sp.block_diag(blocks, format="csr"), friction=law)
     impulse = rng.standard_normal(m)
     impulse[ptr[:-1]] += 0.5
-    linear, disk = judge_and_linearise_impulse(problem, impulse), problem.disk
-    twin, root = Twin(spec_of(disk)), linear.root.astype(L)
-    z, s = root * linear.impulse, linear.slack / root
+    linear = judge_and_linearise_impulse(problem, impulse)
+    disk = problem.disk
+    twin = Twin(spec_of(disk))
+    root = linear.root.astype(L)
+    z = root * linear.impulse
+    s = linear.slack / root
     y = z - s
     if kind == "rows":
         low, high = root * disk.cones.lower, root * disk.cones.upper
         np.testing.assert_allclose(linear.residual.astype(L), z - np.clip(y, low, high), rtol=1e-13)
         np.testing.assert_array_equal(linear.p, (low < y) & (y < high))
         return
-    states, at = set(), 0
+    states = set()
+    at = 0
     for k in range(n):
         block = slice(ptr[k], ptr[k + 1])
         size = ptr[k + 1] - ptr[k]
         components = [(list(range(1, size)), twin.mu[k])] if disk.cones.kind[k] == ROUND else twin.parts(k)
         components = [(rows, a * root[block][rows[0]] / root[block][0]) for rows, a in components]
         states.add(tuple(linear.case[block]))
-        p, at = linear.p[at : at + size**2].reshape(size, size), at + size**2
+        p = linear.p[at : at + size**2].reshape(size, size)
+        at = at + size**2
         expected = project(law, y[block], components)
         scale = np.abs(z[block]).max() + np.abs(s[block]).max()
         np.testing.assert_allclose(

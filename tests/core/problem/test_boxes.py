@@ -33,7 +33,9 @@ def test_findex_round_trip_in_any_order_is_equal(seed):
     rng = np.random.default_rng(seed)
     bounded, contacts = int(rng.integers(0, 4)), int(rng.integers(0, 4))
     tangents = rng.integers(0, 3, contacts)
-    low, high, index = list(-rng.uniform(0, 1, bounded)), list(rng.uniform(0, 1, bounded)), [-1] * bounded
+    low = list(-rng.uniform(0, 1, bounded))
+    high = list(rng.uniform(0, 1, bounded))
+    index = [-1] * bounded
     for t in tangents:
         normal = len(index)
         mu = rng.choice([0.0, 0.25, 0.5, 1.0], t)
@@ -45,7 +47,8 @@ def test_findex_round_trip_in_any_order_is_equal(seed):
     back = np.argsort(order)
     given_ = np.array([-1 if index[i] < 0 else back[index[i]] for i in order], int)
     low, high = np.array(low)[order], np.array(high)[order]
-    a, b = np.eye(m) * rng.uniform(1, 2, m) + 0.1, rng.normal(size=m)
+    a = np.eye(m) * rng.uniform(1, 2, m) + 0.1
+    b = rng.normal(size=m)
     guess = rng.uniform(0.0, 1.0, m)
     problem = lv.Problem.from_findex(a, b, low, high, given_, guess=guess)
     rows = lv.Problem.findex_order(given_)
@@ -104,7 +107,8 @@ def test_cones_of_two_coefficients_return_them_and_equal_ones_are_a_disk():
 @pytest.mark.parametrize("mass", ["in order", "in another order"])
 def test_converted_ellipses_share_the_factor_of_the_mass_matrix(mass):
     """Bit for bit what J with longer rows and the same M come to, although M is neither checked nor factored again."""
-    rng, n = np.random.default_rng(0), 12
+    rng = np.random.default_rng(0)
+    n = 12
     half = np.eye(n) + np.diag(rng.normal(size=n - 1), 1)
     M = half @ half.T
     if mass == "in another order":  # an arrow, which fills in as it stands
@@ -143,7 +147,8 @@ ELLIPSES = {
 @pytest.mark.parametrize("form", ELLIPSES)
 def test_solution_of_ellipses_is_in_the_given_rows(form):
     problem = ELLIPSES[form](3, friction="cone")
-    s, calls = problem.cones.stretch, []
+    s = problem.cones.stretch
+    calls = []
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None)
     r = lv.residual(problem, found.impulse)
     np.testing.assert_allclose(found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12)

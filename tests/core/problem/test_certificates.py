@@ -62,9 +62,13 @@ def held(law, soft, form):
     if law == "linear":  # no contacts: J and M of free rows
         ends = np.full(2, np.inf)
         return lv.Problem.from_jacobian(
-            [[1.0], [-1.0]], [[1.0]], [0.0], target=[0.1, 0.1], cones=lv.Cones.bounded(-ends, ends),
+            [[1.0], [-1.0]],
+            [[1.0]],
+            [0.0],
+            target=[0.1, 0.1],
+            cones=lv.Cones.bounded(-ends, ends),
             compliance=np.full(2, soft),
-        )  # fmt: skip
+        )
     return FORMS[form](problem)
 
 
@@ -98,7 +102,8 @@ def test_infeasible_rigid_rows_among_soft_ones_are_found(seed, form):
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(60, 90)), int(rng.integers(69, 96))
     pair = np.array([rng.choice(n, 2, replace=False) for _ in range(m)], np.int32)
-    target, lower = rng.normal(0.0, 0.1, m), np.where(rng.random(m) < 0.5, -np.inf, 0.0)
+    target = rng.normal(0.0, 0.1, m)
+    lower = np.where(rng.random(m) < 0.5, -np.inf, 0.0)
     soft = np.where(rng.random(m) < 0.3, 1e-6, 0.0)  # 1e-9 of d
     jac = np.zeros((m, 12))
     jac[:, 0], jac[:, 6] = 1.0, -1.0
@@ -109,8 +114,10 @@ def test_infeasible_rigid_rows_among_soft_ones_are_found(seed, form):
 
     j = np.zeros((m, n))
     j[np.arange(m), pair[:, 0]], j[np.arange(m), pair[:, 1]] = 1.0, -1.0
-    free, rigid = lower < 0.0, soft == 0.0
-    one, below = rigid & free, rigid & ~free
+    free = lower < 0.0
+    rigid = soft == 0.0
+    one = rigid & free
+    below = rigid & ~free
     met = linprog(np.zeros(n), A_ub=-j[below], b_ub=-target[below], A_eq=j[one], b_eq=target[one], bounds=(None, None))
     assert solution.status is (lv.Status.CONVERGED if met.success else lv.Status.INFEASIBLE), str(solution)
 
@@ -128,7 +135,8 @@ def test_impulse_bound_holds_for_every_solution(law, form):
         if not solution.success:
             continue
         for _ in range(10):
-            y, c = np.zeros(problem.m), problem.cones
+            y = np.zeros(problem.m)
+            c = problem.cones
             y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (rng.random(len(c.normal_rows)) < 0.5)
             free = np.isneginf(c.lower) & np.isposinf(c.upper) & ~c.contact_rows
             y[free] = rng.normal(size=free.sum())

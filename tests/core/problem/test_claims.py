@@ -13,15 +13,29 @@ from lavender import registry
 
 # Worked out anew at each call, and the caller's own.
 ANEW = {
-    "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "separate_rows", "spin_rows",
-    "rolling_rows", "friction_coefficient", "coefficients", "stretch", "parents", "block_bodies",
-    "is_contact", "is_box", "is_ellipse",
-}  # fmt: skip
+    "contact_rows",
+    "friction_rows",
+    "normal_rows",
+    "n_tangents",
+    "n_together",
+    "separate_rows",
+    "spin_rows",
+    "rolling_rows",
+    "friction_coefficient",
+    "coefficients",
+    "stretch",
+    "parents",
+    "block_bodies",
+    "is_contact",
+    "is_box",
+    "is_ellipse",
+}
 
 
 def test_solver_without_progress_is_stopped_as_stalled(plug_in):
-    name = plug_in(lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0),
-                   resumable=True)  # fmt: skip
+    name = plug_in(
+        lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0), resumable=True
+    )
     solution = lv.solve(random_lcp(5), name, max_iter=10**9)
     assert solution.status is lv.Status.STALLED
     assert "none of the" in solution.message

@@ -17,8 +17,13 @@ def test_fields_of_springs_motors_limits_and_gaps_have_their_documented_effect()
     """Each against the equation of motion, solved by hand."""
     rng = np.random.default_rng(0)
     for _ in range(50):
-        m, h, v = rng.uniform(0.1, 10.0), 10.0 ** rng.uniform(-4, -1), rng.normal()
-        k, c, error, force = (10.0 ** rng.uniform(-1, 6), 10.0 ** rng.uniform(-2, 3), rng.normal(), rng.uniform(0, 30))
+        m = rng.uniform(0.1, 10.0)
+        h = 10.0 ** rng.uniform(-4, -1)
+        v = rng.normal()
+        k = 10.0 ** rng.uniform(-1, 6)
+        c = 10.0 ** rng.uniform(-2, 3)
+        error = rng.normal()
+        force = rng.uniform(0, 30)
         spring = moved(m, v, compliance=1.0 / (h * (h * k + c)), target=-k * error / (h * k + c))
         # m (v+ - v) = -h (k (C + h v+) + c v+)
         assert spring == pytest.approx((m * v - h * k * error) / (m + h * (h * k + c)), rel=1e-9, abs=1e-9)
@@ -37,9 +42,15 @@ def test_target_of_a_belt_moves_the_body_on_it(belt_is_a):
     v = np.array([[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]])
     side = 1.0 if belt_is_a else -1.0
     rows = lv.Rows(
-        np.ones(1), np.zeros((1, 3, 3)), v, normal=[[0.0, 0.0, side]], tangent=[[1.0, 0.0, 0.0]],
-        contact_body=[[-1, 0] if belt_is_a else [0, -1]], arm_a=np.zeros((1, 3)), arm_b=np.zeros((1, 3)),
-    )  # fmt: skip
+        np.ones(1),
+        np.zeros((1, 3, 3)),
+        v,
+        normal=[[0.0, 0.0, side]],
+        tangent=[[1.0, 0.0, 0.0]],
+        contact_body=[[-1, 0] if belt_is_a else [0, -1]],
+        arm_a=np.zeros((1, 3)),
+        arm_b=np.zeros((1, 3)),
+    )
     problem = lv.Problem.from_rows(rows, mu=5.0, target=[0.0, side * 0.3, 0.0])
     after = problem.velocity(lv.solve(problem, tol=1e-12).impulse)
     np.testing.assert_allclose(after.ravel()[:3], [0.3, 0.0, 0.0], atol=1e-9)

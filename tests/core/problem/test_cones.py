@@ -31,7 +31,9 @@ def test_projection_is_feasible_idempotent_and_nearest(seed, size):
     # Scaling a tangent back to its disk rounds once each time.
     np.testing.assert_allclose(twice, y, rtol=1e-15, atol=0.0)
     for i in range(cones.n_blocks):
-        j, end, nt = cones.ptr[i], cones.ptr[i + 1], cones.n_tangents[i]
+        j = cones.ptr[i]
+        end = cones.ptr[i + 1]
+        nt = cones.n_tangents[i]
         if cones.kind[i] == lv.ROW:
             assert np.all(y[j:end] == np.clip(x[j:end], cones.lower[j:end], cones.upper[j:end]))
             continue
@@ -52,13 +54,16 @@ def test_projection_is_feasible_idempotent_and_nearest(seed, size):
     [
         ("lower", 0, 3.0, "row 0: lower = 3.0, upper = 2.0"),
         ("upper", 0, -np.inf, "row 0: lower = -inf, upper = -inf"),
-        ("lower", 0, -1e61, "lower must be at most 1e[+]60"), ("mu", 1, -0.5, "mu must not be negative"),
-        ("mu", 1, 1e-70, "mu must be 0 or at least 1e-60"), ("patch_radius", 1, -1.0, "patch_radius"),
+        ("lower", 0, -1e61, "lower must be at most 1e[+]60"),
+        ("mu", 1, -0.5, "mu must not be negative"),
+        ("mu", 1, 1e-70, "mu must be 0 or at least 1e-60"),
+        ("patch_radius", 1, -1.0, "patch_radius"),
         ("mu", 1, 1e-60, "mu patch_radius .* must be 0 or at least 1e-60"),
-        ("rolling", 0, -1.0, "rolling"), ("kind", 1, 4, "block 1 is a box"),
+        ("rolling", 0, -1.0, "rolling"),
+        ("kind", 1, 4, "block 1 is a box"),
         ("ptr", 1, 0, "must start with 0 and increase"),
     ],
-)  # fmt: skip
+)
 def test_faults_of_blocks_have_one_message_for_arrays_and_lists(name, at, value, words):
     cones = lv.Cones.bounded([-np.inf], [2.0]) + lv.Cones.contacts(0.5, 2, 0.1)
     fields = {

@@ -29,13 +29,17 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
     lam = lv.solve(p, max_iter=50).impulse
     if form == "matrix":
         a = p.dense()
-        own, data, velocities = a**2 @ lam**2, a**2 @ lam**2 + p.b**2, 0.0 * p.b
+        own = a**2 @ lam**2
+        data = a**2 @ lam**2 + p.b**2
+        velocities = 0.0 * p.b
     else:
         a, jac, inverse, mass, free = dense_parts(p)
-        x, pushed = inverse @ jac.T @ lam, jac.T**2 @ lam**2
+        x = inverse @ jac.T @ lam
+        pushed = jac.T**2 @ lam**2
         through = (jac @ inverse) ** 2
         rounded_mass = jac**2 @ inverse**2 @ (jac.T @ lam) ** 2 if mass is None else through @ mass**2 @ x**2
-        own, b2 = a**2 @ lam**2, (p.b + jac @ free) ** 2 + 2 * jac**2 @ free**2
+        own = a**2 @ lam**2
+        b2 = (p.b + jac @ free) ** 2 + 2 * jac**2 @ free**2
         data = jac**2 @ x**2 + through @ pushed + rounded_mass + p.compliance**2 * lam**2 + b2
         velocities = 0.0 * p.b
         if form == "generalized":
@@ -83,7 +87,8 @@ def test_jacobian_in_float32_is_widened_exactly():
     assert lv.residual(p, p.start()).precision == "float32"  # the judge takes the problem's
     assert lv.residual(p, p.start(), precision="float64").precision == "float64"
     assert lv.solve(p).residual.precision == "float64"  # our solvers work in float64
-    jac, mass = sp.csr_array(p.generalized.jac), p.generalized.mass.toarray()
+    jac = sp.csr_array(p.generalized.jac)
+    mass = p.generalized.mass.toarray()
     v = p.generalized.v_free
     for j, m, free, precision in (
         (jac.astype(np.float32), sp.csr_array(mass.astype(np.float32)), v.astype(np.float32), "float32"),
@@ -100,7 +105,8 @@ def test_jacobian_in_float32_is_widened_exactly():
 def test_generalized_mass_summed_in_float32_may_be_asymmetric_in_the_last_bit():
     mass = np.array([[2.0, 0.3], [0.3, 1.0]], np.float32)
     mass[0, 1] = np.nextafter(mass[0, 1], np.float32(1))
-    jac, v = np.eye(2, dtype=np.float32), np.zeros(2, np.float32)
+    jac = np.eye(2, dtype=np.float32)
+    v = np.zeros(2, np.float32)
     made = lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.free(2))
     assert made.generalized.mass.toarray()[1, 0] == mass[1, 0]
     with pytest.raises(lv.InputError, match="M is not symmetric"):

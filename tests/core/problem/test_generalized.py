@@ -16,7 +16,8 @@ import lavender as lv
 
 def row_by_row(mass, x):
     """M^-1 x by M = L^T D L, a row after the other."""
-    low, x = np.tril(mass), x.copy()
+    low = np.tril(mass)
+    x = x.copy()
     n = len(x)
     for k in range(n - 1, -1, -1):
         for a in range(k - 1, -1, -1):
@@ -103,10 +104,19 @@ def test_problem_updated_has_the_same_structure_and_new_numbers():
     problem = random_generalized_problem(9, "cone")
     general = problem.generalized
     rng = np.random.default_rng(0)
-    jac, v = general.jac.toarray() * 1.1, rng.normal(size=general.nv)
+    jac = general.jac.toarray() * 1.1
+    v = rng.normal(size=general.nv)
     new = problem.updated(J=jac, M=2.0 * general.mass.toarray(), v_free=v, target=0.1)
-    made = lv.Problem.from_jacobian(jac, 2.0 * general.mass.toarray(), v, target=0.1, cones=problem.cones,
-                                    compliance=problem.compliance, friction="cone", name=problem.name)  # fmt: skip
+    made = lv.Problem.from_jacobian(
+        jac,
+        2.0 * general.mass.toarray(),
+        v,
+        target=0.1,
+        cones=problem.cones,
+        compliance=problem.compliance,
+        friction="cone",
+        name=problem.name,
+    )
     assert new == made
     assert problem.updated(b=2.0 * problem.b).b[0] == 2.0 * problem.b[0]
     assert problem.updated(b=problem.b) == problem
@@ -148,7 +158,8 @@ def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, comp
     """From any start: the judge's end, and the velocities of another solver."""
     rng = np.random.default_rng(seed)
     m = int(cones.ptr[-1])
-    jac, half = rng.normal(size=(m, 14)), rng.normal(size=(2, 7, 7))
+    jac = rng.normal(size=(m, 14))
+    half = rng.normal(size=(2, 7, 7))
     first = np.arange(m) // size % 2 == 0
     jac[first, 7:] = jac[~first, :7] = 0.0
     mass = scipy.linalg.block_diag(*(half @ half.swapaxes(1, 2) + np.eye(7)))
@@ -178,8 +189,12 @@ def cloth(side, seed, friction="cone"):
     rng = np.random.default_rng(seed)
     n = side * side
     number = rng.permutation(n).reshape(side, side)  # in no order that anybody meant
-    pairs = np.concatenate([np.stack([number[1:], number[:-1]], -1).reshape(-1, 2),
-                            np.stack([number[:, 1:], number[:, :-1]], -1).reshape(-1, 2)])  # fmt: skip
+    pairs = np.concatenate(
+        [
+            np.stack([number[1:], number[:-1]], -1).reshape(-1, 2),
+            np.stack([number[:, 1:], number[:, :-1]], -1).reshape(-1, 2),
+        ]
+    )
     jac = sp.lil_array((len(pairs) + 3 * side, n))
     for i, (a, b) in enumerate(pairs):
         jac[i, a], jac[i, b] = 1.0, -1.0
@@ -187,9 +202,13 @@ def cloth(side, seed, friction="cone"):
         jac[len(pairs) + i, number[i // 3, i % 3]] = 1.0
     cones = lv.Cones.bounded(np.full(len(pairs), -np.inf), np.full(len(pairs), np.inf))
     return lv.Problem.from_jacobian(
-        jac.tocsr(), sp.diags_array(rng.uniform(0.5, 2.0, n)), rng.normal(size=n),
-        cones=cones + lv.Cones.contacts(0.5, 2, count=side), compliance=0.2, friction=friction,
-    )  # fmt: skip
+        jac.tocsr(),
+        sp.diags_array(rng.uniform(0.5, 2.0, n)),
+        rng.normal(size=n),
+        cones=cones + lv.Cones.contacts(0.5, 2, count=side),
+        compliance=0.2,
+        friction=friction,
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -16,13 +16,15 @@ from lavender.judge.certificates import check_certificate
 
 def equals_the_twin(problem, lam):
     """Everything the judge says of an impulse, and what it is made of; 1e-9: M and its inverse, roots of many terms."""
-    twin, found = judge_twin.Problem(spec_of(problem)), lv.residual(problem, lam)
+    twin = judge_twin.Problem(spec_of(problem))
+    found = lv.residual(problem, lam)
     close = 1e-9 if problem.operator == "generalized" else 1e-12
     np.testing.assert_allclose(problem.disk.d, twin.d.astype(float), rtol=close)
     np.testing.assert_allclose(problem.disk.metric.nu, twin.nu.astype(float), rtol=close)
     x = lam / twin.stretch
     w = twin.slack(x)
-    e, size = twin.error(x, w), (twin.size @ np.abs(x) + twin.b_size).astype(float)
+    e = twin.error(x, w)
+    size = (twin.size @ np.abs(x) + twin.b_size).astype(float)
     np.testing.assert_allclose(found.slack * twin.stretch, w, rtol=0, atol=close * size.max())
     np.testing.assert_allclose(found.error, twin.stretch * e, rtol=0, atol=1e-10 * np.abs(e).max())
     said = twin.judge(lam)
@@ -30,7 +32,8 @@ def equals_the_twin(problem, lam):
     speeds = twin.speeds(e)
     assert speeds[found.worst_row] == pytest.approx(float(speeds.max()), rel=1e-9)
     for impulse in (lam, lv.solve(problem, tol=1e-9).impulse):
-        found, said = lv.residual(problem, impulse, tol=0.0), twin.judge(impulse)
+        found = lv.residual(problem, impulse, tol=0.0)
+        said = twin.judge(impulse)
         first = min(said.unrefined, 0.1 * said.relative)  # of a pass that need not be refined
         assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed + first
         # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
@@ -57,7 +60,8 @@ def test_the_judge_equals_its_twin_on_round_cones(seed, tangents, soft):
 
 def error_of_the_pass(problem, lam):
     """How far the judge's slack is from the exact one, as a relative residual, over its floor."""
-    found, twin = lv.residual(problem, lam), judge_twin.Problem(spec_of(problem))
+    found = lv.residual(problem, lam)
+    twin = judge_twin.Problem(spec_of(problem))
     lost = np.abs(found.slack * twin.stretch - twin.slack(lam / twin.stretch))
     energy = np.sqrt((lost**2 / twin.d).sum()) / found.energy_at_zero
     velocity = (lost * np.sqrt(twin.nu / twin.d)).max() / found.velocity_at_zero
@@ -88,12 +92,14 @@ def test_floor_over_bodies_counts_their_rounding(friction, seed):
 def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
     problem = CONTACTS[kind](seed)
     lam = np.random.default_rng(seed).normal(size=problem.m)
-    jac, minv = problem.jacobian.toarray(), problem.rows.inverse_mass_matrix().toarray()
+    jac = problem.jacobian.toarray()
+    minv = problem.rows.inverse_mass_matrix().toarray()
     a = jac @ minv @ jac.T + np.diag(problem.compliance)
     free = problem.rows.v_free.ravel()
     # 1e-13 of the size of what is added: a few roundings on a few dozen terms, of J and M those of M and its inverse.
     for form, given_by in FORMS.items():
-        p, atol = given_by(problem), 1e-11 if form == "J and M" else 1e-13
+        p = given_by(problem)
+        atol = 1e-11 if form == "J and M" else 1e-13
         np.testing.assert_allclose(p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max())
         np.testing.assert_allclose(p.dense(), a, atol=atol * np.abs(a).max())
         assert p.csr.has_canonical_format
@@ -109,7 +115,8 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
 def test_energy_change_is_the_difference_of_kinetic_energies(seed):
     problem = random_contact_problem(seed)
     problem = FORMS["J and M"](problem)
-    lam, general = np.random.default_rng(seed).normal(size=problem.m), problem.generalized
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    general = problem.generalized
     before, after = (0.5 * v @ general.momentum_of(v) for v in (general.v_free, problem.velocity(lam)))
     # Both energies are sums of a few dozen products, with a solve with M before them.
     assert problem.energy_change(lam) == pytest.approx(after - before, abs=1e-10 * (before + after))
@@ -120,9 +127,12 @@ def test_energy_change_of_a_solution_without_targets_is_not_positive(seed):
     problem = random_contact_problem(seed)
     free = problem.generalized if problem.rows is None else problem.rows
     problem = lv.Problem.from_jacobian(
-        problem.jacobian, np.linalg.inv(problem.rows.inverse_mass_matrix().toarray()), free.v_free.ravel(),
-        cones=problem.cones, compliance=problem.compliance,
-    )  # fmt: skip
+        problem.jacobian,
+        np.linalg.inv(problem.rows.inverse_mass_matrix().toarray()),
+        free.v_free.ravel(),
+        cones=problem.cones,
+        compliance=problem.compliance,
+    )
     solution = lv.solve(problem, tol=1e-9)
     before = 0.5 * problem.generalized.v_free @ problem.generalized.momentum_of(problem.generalized.v_free)
     assert solution.success and problem.energy_change(solution.impulse) <= 1e-8 * before
@@ -181,14 +191,16 @@ def test_certificate_check_equals_its_twin(kind, law, seed):
     else:
         normals = lv.Cones.contacts([0.0, 0.0], 0)
         made = kind != "normals" and CONTACTS[kind](seed, law, bodies=3, joints=0, contacts=2)
-        cones, share = made.cones if made else normals, rng.choice([0.0, 0.9, 1.1])
+        cones = made.cones if made else normals
+        share = rng.choice([0.0, 0.9, 1.1])
         y = np.zeros(cones.n_rows)
         y[cones.normal_rows] = rng.uniform(0.1, 1.0, 2)
         for i, (rows, _) in ((k, part) for k in range(2) for part in parts(cones, k)):
             way = rng.normal(size=len(rows))
             y[rows] = share * y[cones.ptr[i]] * cones.friction_coefficient[rows] * way / np.linalg.norm(way)
     y = y * rng.choice([1.0, 1.0, 1.0, -1.0])
-    m, g = len(y), rng.normal(size=(len(y), len(y)))
+    m = len(y)
+    g = rng.normal(size=(len(y), len(y)))
     off = rng.random() < 0.8
     for _ in range(2):  # once leaves rounding of what was there, much of a row that y takes nearly all of
         g -= np.outer(y, y @ g) / max(y @ y, 1e-9) * off
@@ -240,7 +252,8 @@ def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(frictio
 
 def test_certificate_of_a_sum_within_rounding_is_rejected():
     """A^T y is (0, 0, -2^-53), which impulses of 3e7 N s meet to 1e-9; exact zeros are a proof at the same b.y."""
-    y, b = [1.0, 1.0, -1.0], np.array([1.0, 0.0, 1.0 - 3e-9])
+    y = [1.0, 1.0, -1.0]
+    b = np.array([1.0, 0.0, 1.0 - 3e-9])
     for small, proves in ((2.0**-53, False), (0.0, True)):
         a = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, small], [1.0, 1.0, 1.0]])
         for upper in (np.inf, 1e12):
@@ -250,7 +263,8 @@ def test_certificate_of_a_sum_within_rounding_is_rejected():
         if not proves:
             assert lv.residual(problem, met).relative < 2e-9
     for jac, proves in (([[1.0], [-1.0]], True), ([[1.0], [2.0**-30 - 1.0]], False)):
-        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-10]
+        cones = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf])
+        target = [1.0, -1.0 + 1e-10]
         opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
         assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
 

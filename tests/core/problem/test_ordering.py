@@ -28,7 +28,8 @@ def test_named_orders_are_permutations_with_joints_first(order, seed):
 @given(seed=seeds)
 def test_block_colors_share_no_moving_body(seed):
     problem = random_contact_problem(seed, bodies=6, contacts=20)
-    o, color = compute_block_order(problem, "colored"), compute_block_colors(problem)
+    o = compute_block_order(problem, "colored")
+    color = compute_block_colors(problem)
     body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
     for c in range(color.max() + 1):
         moving = body[color == c].ravel()
@@ -41,7 +42,9 @@ def test_block_colors_share_no_moving_body(seed):
 @given(seed=seeds)
 def test_block_colors_of_a_matrix_share_no_entry(seed):
     problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
-    color, a, ptr = compute_block_colors(problem), problem.dense(), problem.cones.ptr
+    color = compute_block_colors(problem)
+    a = problem.dense()
+    ptr = problem.cones.ptr
     for i in range(problem.n_blocks):
         for j in range(i):
             if color[i] == color[j]:

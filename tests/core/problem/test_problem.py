@@ -32,7 +32,8 @@ def test_problem_law_follows_from_the_kinds_of_blocks():
 def test_problem_of_v_free_has_the_b_of_its_target(given_by, seed):
     problem = FORMS[given_by](random_contact_problem(seed))
     form = problem.velocity_form()
-    k, s = form.jacobian.toarray(), form.scale
+    k = form.jacobian.toarray()
+    s = form.scale
     a = (k @ k.T + np.diag(form.theta)) / np.outer(s, s)
     np.testing.assert_allclose(a, problem.dense(), atol=1e-12 * np.abs(a).max())
     np.testing.assert_allclose(form.rhs / s, problem.b, rtol=1e-14)
@@ -61,8 +62,11 @@ def test_problem_rows_have_names():
     kj = problem.rows.n_joints
     first = int(problem.cones.ptr[kj])
     assert [problem.row_name(first + i) for i in range(4)] == [
-        "contact 0, normal", "contact 0, tangent 1", "contact 0, tangent 2", "contact 0, spin",
-    ]  # fmt: skip
+        "contact 0, normal",
+        "contact 0, tangent 1",
+        "contact 0, tangent 2",
+        "contact 0, spin",
+    ]
     cone = lv.Problem(np.ones(6), lv.Cones.contacts(0.5, 5), np.eye(6), friction="cone")
     assert [cone.row_name(i) for i in (3, 4)] == ["contact 0, spin", "contact 0, roll 1"]
     named = lv.Problem(
@@ -118,12 +122,21 @@ def given_arrays():
     rows = general.rows
     jac = general.jacobian.toarray()
     given = {
-        "A": random_lcp(3).dense(), "b": np.array(random_lcp(3).b), "lower": np.zeros(12), "upper": np.full(12, 2.0),
-        "mu": np.full(4, 0.5), "patch": np.full(4, 0.1), "guess": np.zeros(12),
-        "J": jac, "M": 2.0 * np.eye(jac.shape[1]),
-        "v": np.ones(jac.shape[1]), "target": np.array(general.b), "soft": np.full(general.m, 1e-3),
-        "warm": np.zeros(general.m), "key": np.arange(12, dtype=np.uint64),
-    }  # fmt: skip
+        "A": random_lcp(3).dense(),
+        "b": np.array(random_lcp(3).b),
+        "lower": np.zeros(12),
+        "upper": np.full(12, 2.0),
+        "mu": np.full(4, 0.5),
+        "patch": np.full(4, 0.1),
+        "guess": np.zeros(12),
+        "J": jac,
+        "M": 2.0 * np.eye(jac.shape[1]),
+        "v": np.ones(jac.shape[1]),
+        "target": np.array(general.b),
+        "soft": np.full(general.m, 1e-3),
+        "warm": np.zeros(general.m),
+        "key": np.arange(12, dtype=np.uint64),
+    }
     return given | {f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name != "copy"}
 
 
@@ -138,7 +151,7 @@ def makers(sparse):
     def of_jacobian(g):
         return lv.Problem.from_jacobian(
             form(g["J"]), form(g["M"]), g["v"], target=g["target"], cones=cones, compliance=g["soft"], guess=g["warm"]
-        )  # fmt: skip
+        )
 
     def blocks_of_mass(g):
         half = g["M"].shape[0] // 2
@@ -159,18 +172,19 @@ def makers(sparse):
             J=form(g["J"]), M=form(g["M"]), v_free=g["v"], target=g["target"], guess=g["warm"]
         ),
         "with a new J": lambda g: of_jacobian(given_arrays()).updated(J=form(g["J"]), b=g["target"]),
-        "of an adopted one": lambda g: (
-            lv.Problem.lcp(given_arrays()["A"], given_arrays()["b"], copy=False).updated(b=g["b"], guess=g["guess"])
+        "of an adopted one": lambda g: lv.Problem.lcp(given_arrays()["A"], given_arrays()["b"], copy=False).updated(
+            b=g["b"], guess=g["guess"]
         ),
         "of another law": lambda g: random_contact_problem(3).relaxed().updated(b=g["target"], guess=g["warm"]),
         "replaced": lambda g: replace(random_contact_problem(3), b=g["target"], guess=g["warm"]),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.coo_array])
 @pytest.mark.parametrize("maker", makers(None))
 def test_problem_with_copy_leaves_arrays_writable_and_unshared(maker, sparse):
-    given, matrices = given_arrays(), []
+    given = given_arrays()
+    matrices = []
     form = sparse and (lambda a: matrices.append(sparse(a)) or matrices[-1])
     problem = makers(form)[maker](given)
     before = pickle.dumps(problem)
@@ -195,13 +209,19 @@ def test_problem_without_copy_shares_read_only_arrays():
 @pytest.mark.parametrize(
     ("rows", "bounds", "tangents"),
     [
-        (6, {"mu": 0.7}, [2, 2]), (6, {"mu": [0.7, 0.2]}, [2, 2]), (4, {"mu": 0.7, "tangents": 1}, [1, 1]),
-        (4, {"mu": [0.7, 0.2]}, [1, 1]), (2, {"mu": 0.0, "tangents": 0}, [0, 0]), (6, {"mu": [(0.7, 0.2)] * 2}, [2, 2]),
+        (6, {"mu": 0.7}, [2, 2]),
+        (6, {"mu": [0.7, 0.2]}, [2, 2]),
+        (4, {"mu": 0.7, "tangents": 1}, [1, 1]),
+        (4, {"mu": [0.7, 0.2]}, [1, 1]),
+        (2, {"mu": 0.0, "tangents": 0}, [0, 0]),
+        (6, {"mu": [(0.7, 0.2)] * 2}, [2, 2]),
     ],
-)  # fmt: skip
+)
 def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangents):
     rng = np.random.default_rng(0)
-    jac, mass, v = rng.normal(size=(rows, 7)), np.eye(7), rng.normal(size=7)
+    jac = rng.normal(size=(rows, 7))
+    mass = np.eye(7)
+    v = rng.normal(size=7)
     problem = lv.Problem.from_jacobian(jac, mass, v, **bounds)
     cones = lv.Cones.contacts(np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0])
     assert problem == lv.Problem.from_jacobian(jac, mass, v, cones=cones)

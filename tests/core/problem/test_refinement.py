@@ -33,9 +33,12 @@ def ill_problem(seed, condition, law="lcp", n=8):
     else:
         cones = lv.Cones.contacts(rng.uniform(0.1, 0.8, 2), 2)
     return lv.Problem.from_jacobian(
-        rng.standard_normal((cones.n_rows, n)), conditioned(rng, n, condition), rng.standard_normal(n), cones=cones,
+        rng.standard_normal((cones.n_rows, n)),
+        conditioned(rng, n, condition),
+        rng.standard_normal(n),
+        cones=cones,
         friction="cone" if law == "cone" else "coulomb",
-    )  # fmt: skip
+    )
 
 
 LAWS = ("linear", "lcp", "coulomb", "cone", "ellipses")
@@ -87,7 +90,9 @@ def test_backend_claims_with_any_condition_of_m_are_true(name):
 @pytest.mark.parametrize("name", lv.available(impulse=True, external=False))
 def test_sweeps_end_where_float64_loses_the_residual(name):
     """Their own residual meets tol, the refined one does not: no sweep makes it smaller."""
-    spec, accepted, count = registry.get(name), 0, 0
+    spec = registry.get(name)
+    accepted = 0
+    count = 0
     for seed in range(3):
         for law in LAWS:
             problem = ill_problem(seed, 1e10, law)
@@ -123,7 +128,8 @@ def test_residual_above_the_floor_is_not_converged():
 def test_a_refined_slack_is_exact_to_the_last_bits(condition, seed):
     problem = ill_problem(seed, condition)
     lam = lv.solve(problem, tol=1e-13).impulse
-    found, twin = lv.residual(problem, lam, tol=0.0), judge_twin.Problem(spec_of(problem))
+    found = lv.residual(problem, lam, tol=0.0)
+    twin = judge_twin.Problem(spec_of(problem))
     exact = twin.slack(lam.astype(np.longdouble))
     # b has a rounding of its own, and long double those of A.
     size = 2.0**-53 * (4.0 * twin.b_size + 2.0**-8 * twin.size @ np.abs(lam))
@@ -134,7 +140,8 @@ def test_a_refined_slack_is_exact_to_the_last_bits(condition, seed):
 def test_refinement_floor_bounds_the_loss_of_the_first_pass(seed, condition):
     problem = ill_problem(seed, condition)
     lam = lv.solve(problem, tol=1e-13).impulse
-    first, found = judge_impulse(problem, lam), lv.residual(problem, lam, tol=0.0)
+    first = judge_impulse(problem, lam)
+    found = lv.residual(problem, lam, tol=0.0)
     # Of errors: rows that their slack holds at a bound have none, whatever is lost of it.
     lost = np.sqrt(np.sum(problem.metric.d * (first.error - found.error) ** 2))
     assert lost <= found.floor_energy

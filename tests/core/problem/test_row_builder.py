@@ -7,7 +7,8 @@ from random_problems import seeds
 
 import lavender as lv
 
-DT, G = 1 / 60, 9.81
+DT = 1 / 60
+G = 9.81
 TOL = 1e-12
 BODY = (1.5, -1.0)  # m, centre of the body of most tests
 EXACT = {"rtol": 0.0, "atol": 1e-10}
@@ -41,37 +42,71 @@ CLOSED_FORMS = [
     ({"motor": {"speed": 2.0, "max_torque": 1000.0}}, (0, 0, 0), (0, 0, 2.0)),
     ({"motor": {"speed": 2.0, "max_torque": 1.0}}, (0, 0, 0), (0, 0, 1.0 * DT * 3.0)),  # its torque is too small
     ({"motor": {"axis": (2.0, 0.0), "speed": 1.0, "max_force": 10.0, "anchor": BODY}}, (0, 0, 0), (5.0 * DT, 0, 0)),
-    ({"slider": {"anchor": BODY, "axis": (1.0, 0.0)},
-      "limit": {"axis": (1.0, 0.0), "value": 0.97, "upper": 1.0, "anchor": BODY}}, (5.0, 2.0, 1.0), (0.03 / DT, 0, 0)),
-    *(({"limit": {"value": value, "lower": 0.0, "upper": 1.0}}, (0, 0, omega), (0, 0, after))
-      for value, omega, after in (
-        (0.5, -3.0, -3.0),  # far from the limit at 0
-        (0.02, -3.0, -0.02 / DT),  # stops at the limit at the end of the step
-        (-0.1, -3.0, 0.2 * 0.1 / DT),  # beyond the lower limit: corrected
-        (0.98, 3.0, 0.02 / DT),
-        (1.1, 0.0, -0.2 * 0.1 / DT))),  # beyond the upper limit
-    *(({"contact": {"point": BODY, "normal": (0.0, 1.0), "gap": gap, "restitution": e}}, (0, speed, 0), (0, after, 0))
-      for gap, speed, e, after in (
-        (0.0, -2.0, 0.5, 1.0),
-        (0.0, -0.9, 0.5, 0.0),  # below the threshold of 1 m/s
-        (0.02, -0.6, 0.0, -0.6),  # does not arrive in this step
-        (0.02, -2.0, 0.0, -0.02 / DT),  # touches at the end of the step
-        (0.02, -2.0, 0.5, 1.0),
-        (0.2, -2.0, 0.5, -2.0),
-        (-0.03, 0.0, 0.0, 0.2 * 0.02 / DT),  # penetration beyond the slop
-        (-0.005, -0.1, 0.0, 0.0))),  # within the slop
-]  # fmt: skip
+    (
+        {
+            "slider": {"anchor": BODY, "axis": (1.0, 0.0)},
+            "limit": {"axis": (1.0, 0.0), "value": 0.97, "upper": 1.0, "anchor": BODY},
+        },
+        (5.0, 2.0, 1.0),
+        (0.03 / DT, 0, 0),
+    ),
+    *(
+        ({"limit": {"value": value, "lower": 0.0, "upper": 1.0}}, (0, 0, omega), (0, 0, after))
+        for value, omega, after in (
+            (0.5, -3.0, -3.0),  # far from the limit at 0
+            (0.02, -3.0, -0.02 / DT),  # stops at the limit at the end of the step
+            (-0.1, -3.0, 0.2 * 0.1 / DT),  # beyond the lower limit: corrected
+            (0.98, 3.0, 0.02 / DT),
+            (1.1, 0.0, -0.2 * 0.1 / DT),
+        )
+    ),  # beyond the upper limit
+    *(
+        ({"contact": {"point": BODY, "normal": (0.0, 1.0), "gap": gap, "restitution": e}}, (0, speed, 0), (0, after, 0))
+        for gap, speed, e, after in (
+            (0.0, -2.0, 0.5, 1.0),
+            (0.0, -0.9, 0.5, 0.0),  # below the threshold of 1 m/s
+            (0.02, -0.6, 0.0, -0.6),  # does not arrive in this step
+            (0.02, -2.0, 0.0, -0.02 / DT),  # touches at the end of the step
+            (0.02, -2.0, 0.5, 1.0),
+            (0.2, -2.0, 0.5, -2.0),
+            (-0.03, 0.0, 0.0, 0.2 * 0.02 / DT),  # penetration beyond the slop
+            (-0.005, -0.1, 0.0, 0.0),
+        )
+    ),  # within the slop
+]
 #: The same of another body or builder.
 CLOSED_FORMS_OF_OTHERS = [
-    ({"hinge": {"anchor": (0.0, 0.0)}}, (0, -G * DT, 0), (0, 1.2 * PENDULUM, PENDULUM),
-     {"inv_mass": 0.5, "inv_inertia": 3.0, "position": (1.2, 0.0)}),
+    (
+        {"hinge": {"anchor": (0.0, 0.0)}},
+        (0, -G * DT, 0),
+        (0, 1.2 * PENDULUM, PENDULUM),
+        {"inv_mass": 0.5, "inv_inertia": 3.0, "position": (1.2, 0.0)},
+    ),
     # m (v+ - v) = h (-k (x + h v+ - rest) - c v+), with m = 2 kg, k = 40 N/m, rest = 1 m, x = 1.3 m, v = -0.4 m/s
-    *(({"spring": {"anchor_a": (0.0, 0.0), "anchor_b": (1.3, 0.0), "length": 1.0, "stiffness": 40.0, "damping": c}},
-       (-0.4, 0, 0), ((2.0 * -0.4 - DT * 40.0 * 0.3) / (2.0 + DT * c + DT**2 * 40.0), 0, 0),
-       {"inv_inertia": 0.0, "position": (1.3, 0.0)}) for c in (0.0, 3.0)),
-    ({"weld": {"anchor": BODY, "anchor_b": BODY + ERROR, "angle_error": 0.1}}, (0, 0, 0),
-     (-0.5 * ERROR[0] / DT + TURNED * ERROR[1], -0.5 * ERROR[1] / DT - TURNED * ERROR[0], TURNED), {"baumgarte": 0.5}),
-]  # fmt: skip
+    *(
+        (
+            {
+                "spring": {
+                    "anchor_a": (0.0, 0.0),
+                    "anchor_b": (1.3, 0.0),
+                    "length": 1.0,
+                    "stiffness": 40.0,
+                    "damping": c,
+                }
+            },
+            (-0.4, 0, 0),
+            ((2.0 * -0.4 - DT * 40.0 * 0.3) / (2.0 + DT * c + DT**2 * 40.0), 0, 0),
+            {"inv_inertia": 0.0, "position": (1.3, 0.0)},
+        )
+        for c in (0.0, 3.0)
+    ),
+    (
+        {"weld": {"anchor": BODY, "anchor_b": BODY + ERROR, "angle_error": 0.1}},
+        (0, 0, 0),
+        (-0.5 * ERROR[0] / DT + TURNED * ERROR[1], -0.5 * ERROR[1] / DT - TURNED * ERROR[0], TURNED),
+        {"baumgarte": 0.5},
+    ),
+]
 
 
 @pytest.mark.parametrize(
@@ -86,7 +121,8 @@ def test_blocks_of_one_planar_body_give_the_velocity_in_closed_form(blocks, befo
 
 
 def test_gear_turns_in_its_ratio_and_conserves_exchanged_impulses():
-    ratio, inertia = 3.0, np.array([2.0, 5.0])
+    ratio = 3.0
+    inertia = np.array([2.0, 5.0])
     builder = lv.RowBuilder([1.0, 1.0], 1 / inertia, [(0, 0, 4.0), (0, 0, 0)], DT, np.array([(0, 0), (4, 0)]))
     builder.hinge(-1, 0, (0.0, 0.0))
     builder.hinge(-1, 1, (4.0, 0.0))
@@ -101,9 +137,12 @@ def test_gear_turns_in_its_ratio_and_conserves_exchanged_impulses():
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize("degrees", [15.0, 35.0])
 def test_a_block_on_an_inclined_plane_slides_only_above_its_friction_angle(dimensions, degrees):
-    mu, angle = 0.5, np.deg2rad(degrees)  # the friction angle is 26.6 degrees
-    down, normal = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
-    velocity, corner = np.array([0.0, -G * DT]), 0.2
+    mu = 0.5
+    angle = np.deg2rad(degrees)  # the friction angle is 26.6 degrees
+    down = np.array([np.cos(angle), -np.sin(angle)])
+    normal = np.array([np.sin(angle), np.cos(angle)])
+    velocity = np.array([0.0, -G * DT])
+    corner = 0.2
     flat = dimensions == 2
     lift = (lambda x: x) if flat else (lambda x: np.array([*x, 0.0]))
     position = [lift(0.1 * normal)]
@@ -142,7 +181,8 @@ def test_a_hinge_in_space_rotates_about_its_axis_alone():
 
 
 def test_a_tilted_hinge_is_turned_back():
-    tilt, axis = 0.01, np.array([0.0, 0.0, 1.0])
+    tilt = 0.01
+    axis = np.array([0.0, 0.0, 1.0])
     builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)), baumgarte=1.0)
     builder.hinge(-1, 0, np.zeros(3), axis, axis_b=(np.sin(tilt), 0.0, np.cos(tilt)))
     _, after = solved(builder)
@@ -154,14 +194,17 @@ def add_everything(builder, lift, axis):
     turn = {} if axis is None else {"axis": axis}
     gear = {} if axis is None else {"axis_a": axis}
     return [
-        builder.hinge(-1, 0, lift(0.0, 0.0), **turn), builder.motor(-1, 0, speed=2.0, max_torque=5.0, **turn),
-        builder.limit(-1, 0, value=0.1, lower=0.0, **turn), builder.distance(0, 1, lift(1.0, 0.2), lift(2.0, 0.5), 1.0),
+        builder.hinge(-1, 0, lift(0.0, 0.0), **turn),
+        builder.motor(-1, 0, speed=2.0, max_torque=5.0, **turn),
+        builder.limit(-1, 0, value=0.1, lower=0.0, **turn),
+        builder.distance(0, 1, lift(1.0, 0.2), lift(2.0, 0.5), 1.0),
         builder.spring(-1, 1, lift(3.0, 3.0), lift(2.2, 1.0), 1.0, stiffness=50.0, damping=1.0),
-        builder.slider(-1, 2, lift(3.0, 0.0), lift(1.0, 1.0)), builder.weld(2, 3, lift(3.5, 0.0)),
+        builder.slider(-1, 2, lift(3.0, 0.0), lift(1.0, 1.0)),
+        builder.weld(2, 3, lift(3.5, 0.0)),
         builder.gear(0, 1, ratio=2.0, **gear),
         builder.contact(-1, 1, lift(2.0, -0.5), lift(0.0, 1.0), gap=-0.01, mu=0.4),
         builder.contact(-1, 3, lift(4.0, -0.5), lift(0.0, 1.0), mu=0.0, restitution=0.5),
-    ]  # fmt: skip
+    ]
 
 
 PLACES = np.array([(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)])
@@ -174,9 +217,12 @@ def test_row_builder_in_two_dimensions_equals_a_plane_in_three():
     spread = np.zeros((4, 6))
     spread[:, [0, 1, 5]] = VELOCITY
     solid = lv.RowBuilder(
-        [1.0, 0.5, 2.0, 1.0], [x * np.eye(3) for x in (3.0, 1.0, 2.0, 0.5)], spread, DT,
+        [1.0, 0.5, 2.0, 1.0],
+        [x * np.eye(3) for x in (3.0, 1.0, 2.0, 0.5)],
+        spread,
+        DT,
         np.hstack([PLACES, np.zeros((4, 1))]),
-    )  # fmt: skip
+    )
     solid_keys = add_everything(solid, lambda x, y: (x, y, 0.0), (0.0, 0.0, 1.0))
     assert flat_keys == solid_keys
     _, planar_velocity = solved(flat, tol=1e-11)
@@ -198,7 +244,8 @@ def test_row_builder_keys_carry_impulses_to_another_order():
     carried = second.problem().carry(solution)
     assert keys[0] == other_keys[0] and keys[2] == other_keys[2]
     for i in (0, 2):
-        before, after = solution.impulse[first.rows_of(keys[i])], carried[second.rows_of(keys[i])]
+        before = solution.impulse[first.rows_of(keys[i])]
+        after = carried[second.rows_of(keys[i])]
         np.testing.assert_array_equal(before, after)
     assert not carried[second.rows_of(other_keys["ball"])].any()
 
@@ -217,7 +264,10 @@ def test_row_builder_blocks_have_names_and_order():
 def largest_velocity_of_a_stack(slop, n=4, dt=1 / 120, steps=360, **options):
     """Return the largest velocity [m/s or rad/s] of n boxes of 1 m in the last 30 of the steps."""
     position = np.array([(0.0, 0.5 + k) for k in range(n)])
-    angle, velocity, solution, largest = np.zeros(n), np.zeros((n, 3)), None, []
+    angle = np.zeros(n)
+    velocity = np.zeros((n, 3))
+    solution = None
+    largest = []
     for _ in range(steps):
         builder = lv.RowBuilder(np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop)
         turn = [np.array([(np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a))]) for a in angle]
@@ -232,7 +282,8 @@ def largest_velocity_of_a_stack(slop, n=4, dt=1 / 120, steps=360, **options):
         start = None if solution is None else problem.carry(solution)
         solution = lv.solve(problem, "pgs", impulse=start, **options)
         velocity = builder.velocity_after(problem, solution.impulse)
-        position, angle = position + dt * velocity[:, :2], angle + dt * velocity[:, 2]
+        position = position + dt * velocity[:, :2]
+        angle = angle + dt * velocity[:, 2]
         largest.append(abs(velocity).max())
     return max(largest[-30:])
 
@@ -294,7 +345,8 @@ def draw_arguments(rng, block_type, n, dimensions):
 @pytest.mark.parametrize("dimensions", [2, 3])
 @given(seed=seeds)
 def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensions, seed):
-    rng, n = np.random.default_rng(seed), 4
+    rng = np.random.default_rng(seed)
+    n = 4
     inertia = np.full(3, 2.0) if dimensions == 2 else np.tile(2.0 * np.eye(3), (3, 1, 1))
     bodies = (np.ones(3), inertia, rng.normal(size=(3, 3 * dimensions - 3)), DT, rng.normal(size=(3, dimensions)))
     single, arrays = lv.RowBuilder(*bodies), lv.RowBuilder(*bodies)
@@ -322,7 +374,11 @@ def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensio
 @pytest.mark.parametrize("e", [1.0, 0.5])
 def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_closed_form(e, planar):
     """Fifty bounces, each with the speed of the last: e^k of the first, whatever gravity adds in the step."""
-    h, speed, up, width, n = 1.0 / 60.0, 4.0, 1, 3 if planar else 6, 2 if planar else 3
+    h = 1.0 / 60.0
+    speed = 4.0
+    up = 1
+    width = 3 if planar else 6
+    n = 2 if planar else 3
     for k in range(50):
         before = np.zeros((1, width))
         before[0, up] = -speed

@@ -19,21 +19,26 @@ def fields(seed):
 
 
 SPOILT = {
-    "nothing": None, "a body that is not there": ("contact_body", (0, 1), 3),
-    "below static": ("joint_body", (1, 0), -2), "a joint of one body": ("joint_body", (0, slice(None)), 1),
+    "nothing": None,
+    "a body that is not there": ("contact_body", (0, 1), 3),
+    "below static": ("joint_body", (1, 0), -2),
+    "a joint of one body": ("joint_body", (0, slice(None)), 1),
     "a contact of one body": ("contact_body", (2, slice(None)), 0),
     "a joint of nobody": ("joint_body", (0, slice(None)), -1),
     "a contact of nobody": ("contact_body", (1, slice(None)), -1),
     "a normal too long by 2e-5": ("normal", (0,), 1.0 + 2e-5),
     "a normal too long by 1e-7": ("normal", (0,), 1.0 + 1e-7),
-    "a normal too long by 1e-11": ("normal", (0,), 1.0 + 1e-11), "a tangent along the normal": ("tangent", (0,), None),
-    "an inertia with a twist": ("inv_inertia", (0, 0, 1), 5.0), "an inertia below zero": ("inv_inertia", (0,), -1.0),
+    "a normal too long by 1e-11": ("normal", (0,), 1.0 + 1e-11),
+    "a tangent along the normal": ("tangent", (0,), None),
+    "an inertia with a twist": ("inv_inertia", (0, 0, 1), 5.0),
+    "an inertia below zero": ("inv_inertia", (0,), -1.0),
     "an inertia about one axis": ("inv_inertia", (0,), np.diag([1.0, 0.0, 0.0])),
     "an inertia of a point": ("inv_inertia", (0,), np.zeros((3, 3))),
     "an inertia near the edge": ("inv_inertia", (0,), np.diag([1.0, 1.0, -0.9e-9])),
     "an inertia at the edge of the door": ("inv_inertia", (0,), 1e-60 * np.eye(3)),
-    "pointers that stand still": ("joint_ptr", (1,), 0), "pointers from one on": ("joint_ptr", (0,), 1),
-}  # fmt: skip
+    "pointers that stand still": ("joint_ptr", (1,), 0),
+    "pointers from one on": ("joint_ptr", (0,), 1),
+}
 
 
 def spoilt(seed, how):
@@ -123,7 +128,8 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
             made = made + lv.Cones.contacts(0.5, tangents=rows - 1)
         return made
 
-    before, now = step([5, 2, 9], [3, 3, 1]), step([9, 5, 7, 2], [1, 3, 3, 1])
+    before = step([5, 2, 9], [3, 3, 1])
+    now = step([9, 5, 7, 2], [1, 3, 3, 1])
     impulse = np.arange(1.0, 8.0)
     wanted = [7.0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]  # 2 has lost its tangents: it starts anew
     assert now.carry((before, impulse)).tolist() == wanted
@@ -132,12 +138,14 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
     assert np.array_equal(before.carry(solution), solution.impulse)
     three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
     assert three.carry((three, np.ones(3))).all()
-    keyed, twice = dataclasses.replace(four, key=np.arange(4)), dataclasses.replace(three, key=[7, 8, 7])
+    keyed = dataclasses.replace(four, key=np.arange(4))
+    twice = dataclasses.replace(three, key=[7, 8, 7])
     for problem, previous, words in (
         (four, three, r"this problem and the previous one, .* \(4 now, 3 before\).*key="),
-        (keyed, three, "no keys in the previous one, "), (keyed, twice, "key 7 of the previous one names 2 blocks"),
+        (keyed, three, "no keys in the previous one, "),
+        (keyed, twice, "key 7 of the previous one names 2 blocks"),
         (twice, dataclasses.replace(three, key=[7, 8, 9]), "key 7 of this problem names 2 blocks"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(lv.InputError, match=words):
             problem.carry((previous, np.ones(3)))
     assert not lv.report.carry_impulses(three, np.ones(3), four).any()  # a report starts such a step from zero
@@ -164,7 +172,10 @@ def test_problem_carry_of_random_keys_equals_a_dict(seed):
         return lv.Problem(np.ones(blocks.n_rows), blocks, np.eye(blocks.n_rows), key=key)
 
     before, now = step(), step()
-    impulse, wanted, old, new = rng.normal(size=before.m), now.start(), before.cones, now.cones
+    impulse = rng.normal(size=before.m)
+    wanted = now.start()
+    old = before.cones
+    new = now.cones
     block_of_key = {key: i for i, key in enumerate(before.key.tolist())}
     for j, key in enumerate(now.key.tolist()):
         i = block_of_key.get(key)

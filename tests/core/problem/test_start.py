@@ -48,7 +48,10 @@ def test_solution_without_keys_is_a_start_of_the_same_blocks():
 
 
 def test_solve_qp_and_batches_start_from_a_result():
-    P, q, G, h = np.diag([1.0, 2.0]), np.array([-1.0, -2.0]), np.array([[1.0, 1.0]]), np.array([0.5])
+    P = np.diag([1.0, 2.0])
+    q = np.array([-1.0, -2.0])
+    G = np.array([[1.0, 1.0]])
+    h = np.array([0.5])
     problem = lv.Problem.from_qp(P, q, G, h)
     solution = lv.solve(problem, tol=1e-9)
     np.testing.assert_array_equal(lv.solve(problem, "pgs", impulse=solution).impulse, solution.impulse)

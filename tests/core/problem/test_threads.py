@@ -54,7 +54,8 @@ for name in {modules}:
 
 def test_an_error_of_one_thread_stops_the_others():
     """This one waits for the error of the other, and is told to begin nothing more."""
-    both, told = threading.Barrier(2, timeout=10.0), []
+    both = threading.Barrier(2, timeout=10.0)
+    told = []
 
     def work(stop):
         both.wait()
@@ -74,7 +75,8 @@ def test_solve_many_inside_threads_does_not_deadlock(monkeypatch):
     """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
     monkeypatch.setattr(threads, "MAX_THREADS", 1)
     threads.get_thread_pool.cache_clear()
-    two, inner = threading.Barrier(2, timeout=10.0), []
+    two = threading.Barrier(2, timeout=10.0)
+    inner = []
 
     def work(stop):
         two.wait()

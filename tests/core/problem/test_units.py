@@ -14,26 +14,39 @@ LENGTH = 8.0  # Lengths are measured in a unit that is smaller by this factor; a
 
 def scale_lengths(problem):
     """Return a problem of bodies in the smaller unit of length, and the factor of the unit of each impulse (m,)."""
-    rows, angular, split = problem.rows, problem.angular_rows, len(problem.rows.jac)
+    rows = problem.rows
+    angular = problem.angular_rows
+    split = len(problem.rows.jac)
     jac = rows.jac.reshape(-1, 4, 3).copy()
     jac[:, 1::2] *= np.where(angular[:split], 1.0, LENGTH)[:, None, None]
     velocity = rows.v_free.copy()
     velocity[:, :3] *= LENGTH
     scaled = replace(
-        rows, jac=jac.reshape(-1, 12), v_free=velocity, arm_a=LENGTH * rows.arm_a, arm_b=LENGTH * rows.arm_b,
+        rows,
+        jac=jac.reshape(-1, 12),
+        v_free=velocity,
+        arm_a=LENGTH * rows.arm_a,
+        arm_b=LENGTH * rows.arm_b,
         inv_inertia=rows.inv_inertia / LENGTH**2,
-    )  # fmt: skip
+    )
     cones = problem.cones
     has_patch = cones.spin_rows >= 0  # For boxes and ellipses this number is a ratio without unit.
     factor = np.where(angular, LENGTH**2, LENGTH)
     cones = replace(
-        cones, patch_radius=np.where(has_patch, LENGTH, 1.0) * cones.patch_radius, rolling=LENGTH * cones.rolling,
-        lower=factor * cones.lower, upper=factor * cones.upper,
-    )  # fmt: skip
+        cones,
+        patch_radius=np.where(has_patch, LENGTH, 1.0) * cones.patch_radius,
+        rolling=LENGTH * cones.rolling,
+        lower=factor * cones.lower,
+        upper=factor * cones.upper,
+    )
     return replace(
-        problem, rows=scaled, cones=cones, b=np.where(angular, 1.0, LENGTH) * problem.b, guess=None,
+        problem,
+        rows=scaled,
+        cones=cones,
+        b=np.where(angular, 1.0, LENGTH) * problem.b,
+        guess=None,
         compliance=problem.compliance / np.where(angular, LENGTH**2, 1.0),
-    ), factor  # fmt: skip
+    ), factor
 
 
 @pytest.mark.parametrize("kind", sorted(CONTACTS))
@@ -49,7 +62,8 @@ def test_velocity_errors_change_with_the_unit_of_length_as_their_units_say(kind,
         inv_mass[problem.rows.joint_body[0]] = 0.0
         problem = replace(problem, rows=replace(problem.rows, inv_mass=inv_mass))
     scaled, factor = scale_lengths(problem)
-    before, after = lv.residual(problem, impulse), lv.residual(scaled, factor * impulse)
+    before = lv.residual(problem, impulse)
+    after = lv.residual(scaled, factor * impulse)
     units = np.array([problem.row_unit(i) for i in range(problem.m)])
     expected = np.where(units == "m/s", LENGTH, 1.0) * before.velocity_by_row
     # Rounding of a row's own terms: sums with mixed units round differently.
@@ -105,10 +119,16 @@ def test_from_mujoco_rows_of_every_kind_have_the_unit_of_their_velocity():
     for i in range(problem.m):
         units.setdefault(problem.block_name(problem.block_of(i)), []).append(problem.row_unit(i)[0])
     assert {name: "".join(x) for name, x in units.items() if not name.startswith("contact")} == {
-        "equality 0": "mmm", "equality 1": "mmmrrr", "equality 2": "r", "equality 3": "m",
-        "friction of joint hinge": "r", "friction of joint slide": "m",
+        "equality 0": "mmm",
+        "equality 1": "mmmrrr",
+        "equality 2": "r",
+        "equality 3": "m",
+        "friction of joint hinge": "r",
+        "friction of joint slide": "m",
         **{f"friction of joint free, axis {k}": "m" if k < 3 else "r" for k in range(6)},
-        "limit of joint hinge": "r", "limit of joint slide": "m", "limit of joint ball": "r",
-    }  # fmt: skip
+        "limit of joint hinge": "r",
+        "limit of joint slide": "m",
+        "limit of joint ball": "r",
+    }
     spin = [i for i in range(problem.m) if "spin" in problem.row_name(i) or "roll" in problem.row_name(i)]
     assert len(spin) == 3 and {problem.row_unit(i) for i in spin} == {"m/s"}  # nu of the normal.

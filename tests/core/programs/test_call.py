@@ -9,7 +9,8 @@ from calls import installed
 
 import lavender as lv
 
-P, q = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([1.0, 1.0])
+P = np.array([[4.0, 1.0], [1.0, 2.0]])
+q = np.array([1.0, 1.0])
 ROWS = {"G": np.array([[-1.0, 1.0]]), "h": np.array([0.0]), "A": np.array([[1.0, 1.0]]), "b": np.array([1.0])}
 X = np.array([0.5, 0.5])
 

@@ -20,7 +20,8 @@ def drawn(seed, singular=False):
     """A feasible program of up to 8 variables: rows that repeat or are empty, fixed variables, sides at infinity."""
     rng = np.random.default_rng(seed)
     n, me, mi = int(rng.integers(1, 9)), int(rng.integers(0, 3)), int(rng.integers(0, 8))
-    root, x = rng.normal(size=(int(rng.integers(0, n + 1)), n)), rng.normal(size=n)
+    root = rng.normal(size=(int(rng.integers(0, n + 1)), n))
+    x = rng.normal(size=n)
     qp = dict.fromkeys(NAMES) | {"P": root.T @ root, "q": rng.normal(size=n)}
     if singular and rng.random() < 0.5:
         qp["P"] = np.diag(rng.integers(0, 2, n).astype(float))
@@ -47,7 +48,8 @@ def drawn(seed, singular=False):
 @given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6]), off=st.integers(-9, 0))
 def test_solve_qp_found_holds_by_the_errors_of_osqp(seed, tol, off):
     """The three errors of OSQP's paper, from the arrays as given; the objective is within the tolerance, too."""
-    qp, rng = drawn(seed, singular=bool(seed % 2)), np.random.default_rng(seed)
+    qp = drawn(seed, singular=bool(seed % 2))
+    rng = np.random.default_rng(seed)
     problem = lv.Problem.from_qp(**qp)
     best = lv.solve_qp(problem, tol=1e-9)
     wrong = best.impulse + 10.0**off * rng.normal(size=len(best.impulse)) * np.abs(best.impulse)
@@ -86,14 +88,21 @@ def test_solve_qp_answer_has_no_residual_and_no_gap(seed):
 def nearly_singular(seed):
     """A bounded or one-sided program whose P has a condition of 1e4 to 1e10, in five ways."""
     rng = np.random.default_rng(seed)
-    n, least = int(rng.integers(3, 41)), 10.0 ** -rng.uniform(4.0, 10.0)
-    spread, turn = least ** rng.random(n), np.linalg.qr(rng.normal(size=(n, n)))[0]
-    load, chain = rng.normal(size=(n, 1 + n // 3)), np.diff(np.eye(n), axis=0)
+    n = int(rng.integers(3, 41))
+    least = 10.0 ** -rng.uniform(4.0, 10.0)
+    spread = least ** rng.random(n)
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    load = rng.normal(size=(n, 1 + n // 3))
+    chain = np.diff(np.eye(n), axis=0)
     P = (
-        (turn * spread) @ turn.T, np.diag(spread), np.diag(np.where(rng.random(n) < 0.5, 1.0, least)),
-        load @ load.T / n + least * np.eye(n), chain.T @ chain + least * np.eye(n),
-    )[seed % 5]  # fmt: skip
-    G, x = rng.normal(size=(int(rng.integers(n, 4 * n)), n)), rng.normal(size=n)
+        (turn * spread) @ turn.T,
+        np.diag(spread),
+        np.diag(np.where(rng.random(n) < 0.5, 1.0, least)),
+        load @ load.T / n + least * np.eye(n),
+        chain.T @ chain + least * np.eye(n),
+    )[seed % 5]
+    G = rng.normal(size=(int(rng.integers(n, 4 * n)), n))
+    x = rng.normal(size=n)
     qp = dict.fromkeys(NAMES) | {"P": 0.5 * (P + P.T), "q": rng.normal(size=n), "G": G}
     qp["h"] = G @ x + rng.exponential(size=len(G)) * rng.integers(0, 2, len(G))
     box = rng.exponential(size=(2, n)) if rng.random() < 0.7 else np.full((2, n), np.inf)
@@ -121,13 +130,17 @@ def test_x_and_multipliers_equal_qpsolvers(backend, seed):
     if backend not in qpsolvers.available_solvers:
         pytest.skip(f"{backend} is not installed")
     rng = np.random.default_rng(seed)
-    root, inside = rng.normal(size=(4, 4)), rng.uniform(-0.4, 0.4, 4)
+    root = rng.normal(size=(4, 4))
+    inside = rng.uniform(-0.4, 0.4, 4)
     G, A = rng.normal(size=(1, 4)), rng.normal(size=(1, 4))
-    lb, ub = np.array([-0.4, -np.inf, -0.5, -np.inf]), np.array([0.4, 0.5, np.inf, np.inf])
-    hessian, q = root.T @ root + 0.5 * np.eye(4), 3.0 * rng.normal(size=4)
+    lb = np.array([-0.4, -np.inf, -0.5, -np.inf])
+    ub = np.array([0.4, 0.5, np.inf, np.inf])
+    hessian = root.T @ root + 0.5 * np.eye(4)
+    q = 3.0 * rng.normal(size=4)
     qp = qpsolvers.Problem(hessian, q, G, G @ inside, A, A @ inside, lb, ub)
     tight = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000} if backend == "osqp" else {}
-    other, answer = qpsolvers.solve_problem(qp, solver=backend, **tight), lv.solve_qp(lv.Problem.from_qp(qp))
+    other = qpsolvers.solve_problem(qp, solver=backend, **tight)
+    answer = lv.solve_qp(lv.Problem.from_qp(qp))
     assert other.is_optimal(1e-5)
     size = 1.0 + max(np.abs(part).max() for part in (answer.x, answer.y, answer.z, answer.z_box))
     for name in ("x", "y", "z", "z_box"):  # wrong by the backend's tolerance over curvatures and angles of rows
@@ -151,7 +164,8 @@ def test_from_qp_of_sparse_and_dense_matrices_is_the_same_problem(seed):
 
 def with_far_rows(qp, seed, far):
     """The program with more rows of G that are satisfied by far, of any direction."""
-    rng, n = np.random.default_rng(seed), len(qp["q"])
+    rng = np.random.default_rng(seed)
+    n = len(qp["q"])
     more = rng.normal(size=(3, n)) * 10.0 ** rng.uniform(-3.0, 3.0, (3, 1))
     G, h = (np.zeros((0, n)), []) if qp["G"] is None else (qp["G"], qp["h"])
     return qp | {"G": np.vstack([G, more]), "h": np.concatenate([h, far * rng.uniform(1.0, 2.0, 3)])}
@@ -161,7 +175,8 @@ def with_far_rows(qp, seed, far):
 def test_solve_qp_error_does_not_depend_on_inactive_rows(seed, far, off):
     """An unsatisfied equation was hidden by a bound of 1e9: the largest target of any row was what errors were over."""
     qp = drawn(seed)
-    one, two = lv.Problem.from_qp(**qp), lv.Problem.from_qp(**with_far_rows(qp, seed, 10.0**far))
+    one = lv.Problem.from_qp(**qp)
+    two = lv.Problem.from_qp(**with_far_rows(qp, seed, 10.0**far))
     impulse = lv.solve_qp(one).impulse
     impulse = impulse * (1.0 + off) + (off if len(impulse) else 0.0)
     kept = one.qp.n_inequalities or 0 if one.qp.kept is None else len(one.qp.kept)
@@ -190,8 +205,10 @@ def test_solve_qp_within_the_tolerance_of_the_program_has_converged(plug_in):
 
 def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
     """Of more than 64 rows an interior point proves it; impulses are within their bounds and judged as they are."""
-    rng, n = np.random.default_rng(0), 40
-    root, G = rng.normal(size=(n, n)), rng.normal(size=(120, n))
+    rng = np.random.default_rng(0)
+    n = 40
+    root = rng.normal(size=(n, n))
+    G = rng.normal(size=(120, n))
     h = G @ rng.normal(size=n)
     problem = lv.Problem.from_qp(root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0])
     solution = lv.solve_qp(problem).solution
@@ -299,7 +316,9 @@ def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
 def test_solve_qp_without_forces_is_found_only_if_rows_hold(seed):
     """q = 0: every x of P x = 0 that fulfils the rows is a solution."""
     rng = np.random.default_rng(seed)
-    n, rows, root = 90, rng.normal(size=(70, 90)), rng.normal(size=(40, 90))
+    n = 90
+    rows = rng.normal(size=(70, 90))
+    root = rng.normal(size=(40, 90))
     P = root.T @ root
     answer = lv.solve_qp(lv.Problem.from_qp(P, np.zeros(n), G=rows, h=rows @ rng.normal(size=n)))
     assert answer.found and np.abs(P @ answer.x).max() <= 1e-6 and answer.primal_residual <= 1e-7
@@ -310,7 +329,8 @@ def test_solve_qp_without_forces_is_found_only_if_rows_hold(seed):
 def test_two_rows_over_a_singular_p_that_contradict_each_other_are_infeasible(unit, side):
     """a.x = 1 and 3 a.x = 4, or a.x <= -1 and 3 a.x >= 0, whose violations are small relative to a large x."""
     rng = np.random.default_rng(3)
-    a, root = rng.normal(size=11), rng.normal(size=(11, 5))
+    a = rng.normal(size=11)
+    root = rng.normal(size=(11, 5))
     rows = {"A": [a, 3.0 * a], "b": [1.0, 4.0]} if side else {"G": [a, -3.0 * a], "h": [-1.0, 0.0]}
     answer = lv.solve_qp(unit * root @ root.T, np.zeros(11), **rows)
     assert answer.solution.status is lv.Status.INFEASIBLE and not answer.found
@@ -320,8 +340,11 @@ def test_two_rows_over_a_singular_p_that_contradict_each_other_are_infeasible(un
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
 def test_solve_qp_of_contradicting_rows_among_many_returns_a_proof(seed):
     rng = np.random.default_rng(seed)
-    n, conflict = 120, rng.choice(200, 3, replace=False)
-    G, x, weight = rng.normal(size=(200, n)), rng.normal(size=n), rng.uniform(0.5, 1.5, 3)
+    n = 120
+    conflict = rng.choice(200, 3, replace=False)
+    G = rng.normal(size=(200, n))
+    x = rng.normal(size=n)
+    weight = rng.uniform(0.5, 1.5, 3)
     h = G @ x + rng.uniform(0.1, 1.0, 200)
     last, side = -weight @ G[conflict], -weight @ h[conflict]
     P = np.diag((rng.random(n) < 0.5).astype(float))
@@ -369,7 +392,8 @@ def test_solve_qp_with_a_contradicted_claim_is_not_found(plug_in):
 
 
 def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_returned():
-    rng, n = np.random.default_rng(0), 40
+    rng = np.random.default_rng(0)
+    n = 40
     half = rng.normal(size=(n, n))
     problem = lv.Problem.from_qp(
         half @ half.T + 1e-6 * np.eye(n), rng.normal(size=n), rng.normal(size=(60, n)), rng.uniform(0.1, 1.0, 60)

@@ -50,12 +50,20 @@ def test_solve_qp_error_is_the_same_in_all_units(base):
         ({"P": np.zeros((1, 1)), "q": [1.0], "lb": [0.0], "ub": [1e9]}, [-0.5]),
         ({"P": np.eye(1), "q": [0.0], "lb": [-1e9], "ub": [1e9]}, [0.5]),
         # A small coefficient in a row gives a variable a large size, another row a small one.
-        ({"P": np.zeros((3, 3)), "q": np.zeros(3), "A": [[1.0, 1e-12, 0.0], [0.0, 1.0, 1.0]], "b": [1.0, 5.0],
-          "lb": [0.0, 0.0, 0.0]}, [1.0, -1e3, 1005.0]),
+        (
+            {
+                "P": np.zeros((3, 3)),
+                "q": np.zeros(3),
+                "A": [[1.0, 1e-12, 0.0], [0.0, 1.0, 1.0]],
+                "b": [1.0, 5.0],
+                "lb": [0.0, 0.0, 0.0],
+            },
+            [1.0, -1e3, 1005.0],
+        ),
         # A block of the cost of 1e-9 beside one of 1e9.
         ({"P": np.diag([1e9, 1e-9]), "q": [-1e9, -1e-9]}, [1.0, 0.0]),
     ],
-)  # fmt: skip
+)
 def test_judge_of_programs_accepts_no_wrong_point(arrays, x):
     problem = lv.Problem.from_qp(**arrays)
     multipliers = np.zeros(len(problem.qp.target))
@@ -67,7 +75,8 @@ def test_solve_qp_with_new_vectors_has_the_answer_of_a_new_program():
     base = BY_NAME["rank 3"].arrays
     problem = lv.Problem.from_qp(**base)
     for name in ("auto", *installed("osqp", "daqp")):
-        q, h = 1.5 * base["q"], base["h"] + 0.25
+        q = 1.5 * base["q"]
+        h = base["h"] + 0.25
         here = lv.solve_qp(problem, q=q, h=h, solver=name)
         there = lv.solve_qp(lv.Problem.from_qp(**(base | {"q": q, "h": h})), name)
         assert here.found and here.x.tobytes() == there.x.tobytes()

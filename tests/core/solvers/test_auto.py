@@ -23,7 +23,8 @@ def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
     assert count == count_of_matrix
     assert np.array_equal(label, label_of_matrix)
     assert np.array_equal(np.unique(label), np.arange(count))
-    a, lam = problem.dense(), np.random.default_rng(seed).normal(size=problem.m)
+    a = problem.dense()
+    lam = np.random.default_rng(seed).normal(size=problem.m)
     for i in range(count):
         blocks = np.flatnonzero(label == i)
         rows = get_rows_of_blocks(problem, blocks)
@@ -36,7 +37,8 @@ def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
         if problem.rows is not None:
             bodies = np.unique(problem.rows.block_bodies[blocks])
             np.testing.assert_array_equal(part.rows.v_free, problem.rows.v_free[bodies[bodies >= 0]])
-        alone, whole = lv.residual(part, lam[rows]).error, lv.residual(problem, lam).error[rows]
+        alone = lv.residual(part, lam[rows]).error
+        whole = lv.residual(problem, lam).error[rows]
         np.testing.assert_allclose(alone, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
         others = np.setdiff1d(np.arange(problem.m), rows)
         assert not a[np.ix_(rows, others)].any()
@@ -60,7 +62,8 @@ def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
 
 def test_auto_leaves_the_relaxation_of_a_sliding_pyramid_before_it_is_solved():
     problem = lv.suite.case("pyramidF(k=10, sliding=2)").problem
-    solution, relaxed = lv.solve(problem), lv.solve(problem.relaxed("cone"), "newton")
+    solution = lv.solve(problem)
+    relaxed = lv.solve(problem.relaxed("cone"), "newton")
     assert solution.success
     assert [stage.solver for stage in solution.stages] == ["newton on the relaxation", "newton"]
     assert solution.stages[0].work["factorisations"] < relaxed.work["factorisations"]
@@ -78,11 +81,13 @@ def test_auto_turn_of_newton_that_halves_the_residual_continues():
 
 def test_fraction_near_sliding_of_interior_point_equals_that_of_its_impulses():
     problem = lv.suite.case("pyramidF(k=10)").problem.relaxed("cone")
-    state, impulse = Newton().prepare(problem), problem.start()
+    state = Newton().prepare(problem)
+    impulse = problem.start()
     Newton().advance(state, impulse, 8, 1e-9)
     state.system.solve.write_interior_impulse(impulse)
     # In z = D^1/2 impulse, as in the kernel: the mean load of contacts depends on the scale.
-    z, normal = impulse * np.sqrt(problem.d), problem.cones.normal_rows
+    z = impulse * np.sqrt(problem.d)
+    normal = problem.cones.normal_rows
     bound = problem.cones.friction_coefficient[normal + 1] * impulse[normal]
     loaded = z[normal] > 1e-3 * z[normal].mean()
     near = np.hypot(impulse[normal + 1], impulse[normal + 2]) > 0.95 * bound

@@ -59,7 +59,8 @@ def test_sweeps_asymmetric_matrix_with_motor_holds_the_free_rows():
 
 def gear_train(contact, force=1e5, ratio=3.0, wheels=7):
     """Wheels on hinges, each driving the next `ratio` times as fast, and a motor of `force` N m on the first."""
-    dt, nv = 1.0 / 60.0, 3 * wheels
+    dt = 1.0 / 60.0
+    nv = 3 * wheels
     unit = np.eye(nv)
     hinges = [unit[3 * i + k] for i in range(wheels) for k in (0, 1)]
     gears = [
@@ -67,9 +68,12 @@ def gear_train(contact, force=1e5, ratio=3.0, wheels=7):
     ]
     free = len(hinges) + len(gears)
     limit = np.r_[np.full(free, np.inf), force * dt]
-    rows, target, cones = [*hinges, *gears, unit[2]], [0.0] * free + [1.0], lv.Cones.bounded(-limit, limit)
+    rows = [*hinges, *gears, unit[2]]
+    target = [0.0] * free + [1.0]
+    cones = lv.Cones.bounded(-limit, limit)
     if contact:  # The last wheel rests on the ground, and may roll on it.
-        rows, target = [*rows, unit[-2], unit[-3], unit[-1]], [*target, 0.0, 0.0, 0.0]
+        rows = [*rows, unit[-2], unit[-3], unit[-1]]
+        target = [*target, 0.0, 0.0, 0.0]
         cones = cones + lv.Cones.contacts([0.5])
     v = np.zeros(nv)
     v[1::3] = -9.81 * dt
@@ -103,9 +107,13 @@ def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
     np.testing.assert_array_equal(kept.impulse, [0.9, 1e6])  # Without an iteration nothing is judged.
     history = []
     lv.solve(
-        lv.Problem.lcp(np.array([[2.0, 1.0, 0], [1.0, 2.0, 0], [0, 0, 1.0]]), [1.0, 1.0, 1.0]), "jacobi",
-        impulse=[1e6, 1e6, 0.9], tol=1e-9, max_iter=3, callback=lambda n, x, r: history.append(x.copy()),
-    )  # fmt: skip
+        lv.Problem.lcp(np.array([[2.0, 1.0, 0], [1.0, 2.0, 0], [0, 0, 1.0]]), [1.0, 1.0, 1.0]),
+        "jacobi",
+        impulse=[1e6, 1e6, 0.9],
+        tol=1e-9,
+        max_iter=3,
+        callback=lambda n, x, r: history.append(x.copy()),
+    )
     assert np.abs(history[1][:2]).max() < 10.0
     # With tol = 0 the start is kept: one iteration of Jacobi's method depends on it.
     exact = lv.solve(
@@ -125,7 +133,8 @@ def test_solve_start_of_problem_at_rest_begins_at_zero():
 @pytest.mark.parametrize("seed", range(5))
 def test_combine_best_islands_takes_the_smallest_objective_of_each_island(seed):
     """1/2 l.A l - b.l of each of three islands, of impulses within their bounds that are no solutions."""
-    rng, size = np.random.default_rng(seed), 4
+    rng = np.random.default_rng(seed)
+    size = 4
     blocks = [spd(size, seed=10 * seed + k) for k in range(3)]
     a = sp.block_diag([matrix for matrix, _ in blocks])
     problem = lv.Problem.lcp(a, np.concatenate([b for _, b in blocks]))
@@ -146,8 +155,10 @@ def preloaded_problem(seed, law, rhs_size):
     fixed = lv.Cones.bounded([1.0, 0.5, 2.0, 1.0], [1.0, 1.5, np.inf, np.inf])
     rest = lv.Cones.bounded(np.zeros(9), np.full(9, np.inf)) if law == "lcp" else lv.Cones.contacts(np.full(3, 0.5))
     cones = fixed + rest
-    jac, free = rng.standard_normal((len(cones.lower), 16)), rng.standard_normal(16)
-    matrix, b = jac @ jac.T + 0.1 * np.eye(len(jac)), rhs_size * -jac @ free
+    jac = rng.standard_normal((len(cones.lower), 16))
+    free = rng.standard_normal(16)
+    matrix = jac @ jac.T + 0.1 * np.eye(len(jac))
+    b = rhs_size * -jac @ free
     return lv.Problem(b, cones, matrix, friction="cone" if law == "cone" else "coulomb")
 
 

@@ -33,9 +33,11 @@ def blocks_of(kind, rng, n, m):
 @pytest.mark.parametrize("matrix", ["full", "asymmetric", "diag(1, 100)", "condition 1e6"])
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 6, 8])
 def test_block_gauss_seidel_solves_separate_joints_in_one_sweep(rows, matrix):
-    rng, n = np.random.default_rng(7 + rows), 500
+    rng = np.random.default_rng(7 + rows)
+    n = 500
     w = blocks_of(matrix, rng, n, rows) + 0.1 * np.eye(rows) * (matrix == "full")
-    reach, zero = rng.uniform(0.0, 0.5, (2, n * rows)), np.zeros(n)
+    reach = rng.uniform(0.0, 0.5, (2, n * rows))
+    zero = np.zeros(n)
     low, high = np.where(rng.random((2, n * rows)) < 0.3, np.inf, reach) * [[-1.0], [1.0]]
     cones = lv.Cones(rows * np.arange(n + 1), np.zeros(n, int), low, high, zero, zero)
     problem = lv.Problem(rng.standard_normal(n * rows), cones, sp.block_diag(list(map(sp.coo_array, w)), format="csr"))
@@ -79,11 +81,13 @@ MATRICES = ("full", "asymmetric", "diag(1, 100)", "rank one", "condition 1e6")
 )
 def test_block_gauss_seidel_solves_separate_contacts_in_one_sweep(kind, law, matrix):
     """As many as no other meets, by the judge's error of each; what no exact answer is found for is counted."""
-    rng, n = np.random.default_rng(1), 4000
+    rng = np.random.default_rng(1)
+    n = 4000
     mu = np.where(np.arange(n) % 10 == 0, 0.0, 10.0 ** rng.uniform(-2, 1, n))
     cones = CONES[kind](mu, np.where(np.arange(n) % 7 == 0, 0.0, rng.uniform(0.0, 1.0, n)))
     m = cones.n_rows // n
-    w, b = blocks_of(matrix, rng, n, m), rng.standard_normal((n, m))
+    w = blocks_of(matrix, rng, n, m)
+    b = rng.standard_normal((n, m))
     if matrix == "rank one":  # a contact can stick only where b_t lies in the range of W_tt
         b[::2, 1:] = np.einsum("nij,nj->ni", w, b)[::2, 1:]
     a = sp.csr_array(sp.bsr_array((w, np.arange(n), np.arange(n + 1)), shape=(n * m, n * m)))

@@ -126,7 +126,8 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
     """`whole`: small whole numbers, so that w = 0 and lambda = 0 at once. A semidefinite A leaves w alone unique."""
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, max(1, m // 2) if kind == "semidefinite" else m + 2))
-    skew, b = rng.normal(size=(m, m)), 2.0 * rng.normal(size=m)
+    skew = rng.normal(size=(m, m))
+    b = 2.0 * rng.normal(size=m)
     low, high = random_bounds(rng, m)
     if whole:
         g, skew, b = np.rint(g), np.rint(skew), np.rint(b)
@@ -135,7 +136,8 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
     a = g @ g.T + (0.0 if kind == "semidefinite" else 0.5 * np.eye(m))
     a = a + (skew - skew.T if kind == "asymmetric" else 0.0)
     if kind == "semidefinite":  # what has a solution
-        low, high = np.zeros(m), np.full(m, np.inf)
+        low = np.zeros(m)
+        high = np.full(m, np.inf)
         b = a @ np.maximum(b, 0.0) - np.maximum(skew[0], 0.0)
     solution = lv.solve(lv.Problem.lcp(a, b, low, high), name, tol=1e-9)
     assert solution.success and solution.claim_check == "confirmed", solution
@@ -211,7 +213,8 @@ def test_solver_on_an_a_beyond_memory_raises_before_the_start_or_does_not_form_i
     monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 4000)  # J and M have 2,700
     spec = registry.get(name)
     rng = np.random.default_rng(4)
-    jac, mass = rng.normal(size=(90, 15)), np.diag(rng.uniform(1.0, 2.0, 15))
+    jac = rng.normal(size=(90, 15))
+    mass = np.diag(rng.uniform(1.0, 2.0, 15))
     chain = 0.2 * (np.eye(15, k=1) + np.eye(15, k=-1))
     for friction in ("coulomb", "cone"):
         problem = lv.Problem.from_jacobian(

@@ -65,7 +65,8 @@ class Sweeps:
 
     def list_units(self, state):
         """Return the units in the order of a sweep."""
-        units, b = state.units, np.abs(state.problem.b)
+        units = state.units
+        b = np.abs(state.problem.b)
         if self.mistake == "leaves out rows whose b is below a thousandth of the largest":
             units = [unit for unit in units if b[unit[0]] >= 1e-3 * b.max()]
         if self.mistake == "ignores the order":
@@ -90,7 +91,8 @@ class Sweeps:
 
     def measure(self, state, x):
         """Return the number that the solver compares with tol."""
-        judged, p = lv.residual(state.problem, x), state.problem
+        judged = lv.residual(state.problem, x)
+        p = state.problem
         if self.mistake == "stops by one norm over all rows":
             step = np.clip(x - (state.A @ x - p.b) / p.d, p.cones.lower, p.cones.upper) - x
             return 100.0 * np.linalg.norm(p.d * step) / max(np.linalg.norm(p.b), 1e-300)
@@ -157,7 +159,8 @@ class Sweeps:
 
     def components(self, c, i):
         """Yield rows and bound per unit of the normal impulse of each friction component of contact i."""
-        m, first = self.mistake, c.ptr[i]
+        m = self.mistake
+        first = c.ptr[i]
         mu, radius, nt, spin, roll = c.mu[i], c.patch_radius[i], c.n_tangents[i], c.spin_rows[i], c.rolling_rows[i]
         if m == "coefficients are at most one":
             mu = min(mu, 1.0)
@@ -183,23 +186,52 @@ class Sweeps:
 
 ROWS = frozenset({"linear", "lcp"})
 SPEC = lv.SolverSpec(
-    "numpy_sweeps", Sweeps, laws=frozenset({"linear", "lcp", "coulomb"}), box_friction_laws=frozenset({"coulomb"}),
-    operators=frozenset({"matrix"}), supports_rolling=True, max_iter=5000, order=True, seed=True,
+    "numpy_sweeps",
+    Sweeps,
+    laws=frozenset({"linear", "lcp", "coulomb"}),
+    box_friction_laws=frozenset({"coulomb"}),
+    operators=frozenset({"matrix"}),
+    supports_rolling=True,
+    max_iter=5000,
+    order=True,
+    seed=True,
     refusal=lambda p: None if p.is_symmetric or p.law in ROWS else "needs a symmetric A",
     summary="projected Gauss-Seidel in NumPy",
-)  # fmt: skip
+)
 OF_ROWS = replace(SPEC, laws=ROWS, box_friction_laws=frozenset(), supports_rolling=False)
 MISTAKES = (
-    "a lower bound above zero is zero", "an upper bound below zero is zero", "upper bounds are ignored",
-    "bounds are symmetric", "discs are squares", "boxes are squares", "planar friction is doubled",
-    "coefficients are at most one", "tangents are ignored for coefficients above one", "spin is a tangent",
-    "spin is ignored", "spin is bounded without its radius", "rolling is ignored", "rolling is bounded by mu",
-    "update keeps A", "update keeps b", "update keeps the bounds", "update keeps the coefficients",
-    "update keeps the blocks", "counts one sweep", "counts no work", "one iteration more", "stops at zero error",
-    "stops at five times tol", "stops by the energy alone", "stops by the velocity alone",
-    "stops by the change of the impulse", "returns the iterate before the judged one", "ignores the start",
-    "every fourth sweep of a run is skipped", "a counter shared by all solves",
-)  # fmt: skip
+    "a lower bound above zero is zero",
+    "an upper bound below zero is zero",
+    "upper bounds are ignored",
+    "bounds are symmetric",
+    "discs are squares",
+    "boxes are squares",
+    "planar friction is doubled",
+    "coefficients are at most one",
+    "tangents are ignored for coefficients above one",
+    "spin is a tangent",
+    "spin is ignored",
+    "spin is bounded without its radius",
+    "rolling is ignored",
+    "rolling is bounded by mu",
+    "update keeps A",
+    "update keeps b",
+    "update keeps the bounds",
+    "update keeps the coefficients",
+    "update keeps the blocks",
+    "counts one sweep",
+    "counts no work",
+    "one iteration more",
+    "stops at zero error",
+    "stops at five times tol",
+    "stops by the energy alone",
+    "stops by the velocity alone",
+    "stops by the change of the impulse",
+    "returns the iterate before the judged one",
+    "ignores the start",
+    "every fourth sweep of a run is skipped",
+    "a counter shared by all solves",
+)
 
 
 @pytest.fixture
@@ -243,11 +275,12 @@ FAULTS = [
     ("rejects rows of zeros", "problems_are_solved", "a row of A is zero"),
     ("needs a row", "problems_are_solved", "was raised in"),
     ("counts passes", "problems_are_solved", "Its work must count one of backend_calls"),
-    ("spends two iterations", "budgets_are_kept", "max_iter=1"), ("stops at two", "budgets_are_kept", "or the claim"),
+    ("spends two iterations", "budgets_are_kept", "max_iter=1"),
+    ("stops at two", "budgets_are_kept", "or the claim"),
     ("stops at two", "interruptions_return_the_iterate", "TIME_LIMIT after at least 1 iteration is required"),
     ("ignores the order", "orders_change_the_sweep", "give the same bits after 2 sweeps"),
     ("ignores the seed", "orders_change_the_sweep", "give the same bits after 2 sweeps"),
-]  # fmt: skip
+]
 
 
 def failure(spec, name):
@@ -268,11 +301,14 @@ def test_contract_of_a_faulty_solver_names_the_unmet_check(register, monkeypatch
     [
         ("options_match_the_spec", {"options": {"omega": "a factor"}}, "the options omega are in the spec or"),
         ("options_match_the_spec", {"factory": WithOption}, "the options extra are in the spec or in"),
-        ("problems_are_solved", {"laws": {"lcp", "cone"}, "refusal": lambda p: "no" * (p.law == "cone")},
-         "the spec lists the law cone, but refuses every problem with it"),
+        (
+            "problems_are_solved",
+            {"laws": {"lcp", "cone"}, "refusal": lambda p: "no" * (p.law == "cone")},
+            "the spec lists the law cone, but refuses every problem with it",
+        ),
         ("budgets_are_kept", {"refusal": lambda p: "never"}, "the law linear, but refuses every problem with it"),
     ],
-)  # fmt: skip
+)
 def test_contract_of_a_wrong_spec_names_the_unmet_check(register, check, more, words):
     spec = replace(OF_ROWS, **more)
     register(spec)

@@ -48,11 +48,13 @@ def test_factorisation_reads_the_clock_within_two_milliseconds_of_counted_work(k
         n = 1500
         rng = np.random.default_rng(0)
         half = rng.normal(size=(n, 40))
-        system, data = LinearSystem(n), half @ half.T + n * np.eye(n)
+        system = LinearSystem(n)
+        data = half @ half.T + n * np.eye(n)
         least = RATES["work"]["dense"] * n**3 / (3.0 if lu else 6.0)
     else:
         matrix = lattice(17 if lu else 27)  # 4,913 and 19,683 rows
-        system, data = LinearSystem((matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32))), matrix.data
+        system = LinearSystem((matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)))
+        data = matrix.data
         system.analyse()
         least = RATES["work"]["dense"] * system.cost
     deadline = counted_deadline()
@@ -65,7 +67,9 @@ def test_factorisation_reads_the_clock_within_two_milliseconds_of_counted_work(k
 def test_newton_reads_the_clock_within_two_milliseconds_of_counted_work(form):
     """A pile of 2,400 rows; the counted work is at least that of the rows of all steps."""
     problem = fresh(suite.case("granularF(n=7)").problem)
-    deadline, impulse, n = counted_deadline(), problem.start(), 3
+    deadline = counted_deadline()
+    impulse = problem.start()
+    n = 3
     if form == "velocities":
         problem = FORMS["J and M"](problem)
         kernel = general.prepare_islands(problem)
@@ -81,13 +85,16 @@ def test_newton_reads_the_clock_within_two_milliseconds_of_counted_work(form):
 
 def test_lemke_reads_the_clock_within_two_milliseconds_of_counted_work():
     """Three quarters of the rows are free and are retired before the path, whose pivots and exchanges follow."""
-    rng, m, deadline = np.random.default_rng(1), 300, counted_deadline()
+    rng = np.random.default_rng(1)
+    m = 300
+    deadline = counted_deadline()
     half = rng.normal(size=(m, m))
     lower = np.where(np.arange(m) % 4 == 0, 0.0, -np.inf)
     problem = lv.Problem.lcp(half @ half.T / m + 0.1 * np.eye(m), rng.normal(size=m), lower)
     state = PivotState(problem)
     state.set_deadline(deadline)
-    paths, code = lemke.Lemke(state.rows), lemke.EXCHANGES
+    paths = lemke.Lemke(state.rows)
+    code = lemke.EXCHANGES
     paths.set_start(problem.start())
     while code == lemke.EXCHANGES:
         code = paths.run(10**6)
@@ -134,7 +141,8 @@ def test_newton_whose_deadline_passes_inside_a_factorisation_returns_a_finite_im
     if form == "velocities":
         problem = FORMS["J and M"](problem)
     for limit in np.arange(1.5, 40.0, 3.0):
-        impulse, deadline = problem.start(), Deadline(limit)
+        impulse = problem.start()
+        deadline = Deadline(limit)
         if form == "velocities":
             status = general.run_newton_steps(
                 problem, general.prepare_islands(problem), impulse, 9, 1e-9, deadline
@@ -201,7 +209,8 @@ def test_solve_whose_deadline_passes_at_any_reading_returns_a_judged_impulse(nam
 
 @pytest.mark.parametrize("name", ["newton", "pgs", "anderson", "auto"])
 def test_solve_with_a_set_up_beyond_the_limit_makes_no_iteration(name, clock, monkeypatch):
-    problem, solver = dense(100, "lcp"), registry.get(name).load()
+    problem = dense(100, "lcp")
+    solver = registry.get(name).load()
     prepare = solver.prepare
 
     def slow(self, *of):
@@ -318,12 +327,14 @@ def draw_jacobian_problem(seed, m=240, n=150, law="coulomb"):
 @pytest.mark.parametrize("name", ["newton", "admm", "pgs", "auto"])
 def test_prepared_solves_with_other_b_have_the_bits_of_fresh_solves(name, law):
     """The matrices that `prepare` forms stay, also after a solve that a limit ended."""
-    problem, rng = draw_jacobian_problem(3, law=law), np.random.default_rng(1)
+    problem = draw_jacobian_problem(3, law=law)
+    rng = np.random.default_rng(1)
     prepared = lv.prepare(fresh(problem), name)
     for scale in (1.0, 0.5, 2.0):
         b = problem.b * (scale + 0.1 * rng.random(problem.m))
         prepared.solve(b=-b, time_limit=1e-9)
-        kept, other = prepared.solve(b=b, tol=1e-9), lv.solve(fresh(problem).updated(b=b), name, tol=1e-9)
+        kept = prepared.solve(b=b, tol=1e-9)
+        other = lv.solve(fresh(problem).updated(b=b), name, tol=1e-9)
         assert kept.impulse.tobytes() == other.impulse.tobytes() and kept.status is other.status
 
 

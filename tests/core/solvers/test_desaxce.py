@@ -22,9 +22,11 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
     phi, psi = solve.normal_shift(s)
     for i in range(len(sc.ptr) - 1):
-        j, end = sc.ptr[i], sc.ptr[i + 1]
+        j = sc.ptr[i]
+        end = sc.ptr[i + 1]
         reach = sc.reach[sc.part[i] : sc.part[i + 1]]
-        spin, expected = len(reach) == 2, 0.0
+        spin = len(reach) == 2
+        expected = 0.0
         if len(reach):
             expected = reach[0] * np.linalg.norm(s[j + 1 : end - spin])
             expected += reach[1] * abs(s[end - 1]) if spin else 0.0
@@ -48,7 +50,8 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 def test_de_saxce_step_solves_its_linear_system(form, compliant, seed):
     problem = problem_of(seed, compliant)
     system = system_in(problem, "velocity" if form == "augmented" else form)
-    solve, sc = system.solve, system.solve.view_arrays()
+    solve = system.solve
+    sc = system.solve.view_arrays()
     h = dense_h(problem)[np.ix_(sc.keep, sc.keep)]
     first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
     solve.begin_interior(1e-10, 0.9)

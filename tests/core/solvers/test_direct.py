@@ -220,7 +220,8 @@ def test_direct_with_a_good_factor_is_not_refined(m, half, bound):
 def test_direct_shifts_a_singular_asymmetric_matrix_once(seed, m):
     """Free sets of more than m / 2 rows are singular; exchanges may cycle, but no pivot is lost with the shift."""
     rng = np.random.default_rng(seed)
-    g, skew = rng.normal(size=(m, m // 2)), rng.normal(size=(m // 2, m // 2))
+    g = rng.normal(size=(m, m // 2))
+    skew = rng.normal(size=(m // 2, m // 2))
     a = g @ (np.eye(m // 2) + 0.7 * (skew - skew.T)) @ g.T
     x = np.maximum(rng.normal(size=m), 0.0)
     b = a @ x - np.where(x > 0.0, 0.0, rng.random(m))
@@ -238,10 +239,13 @@ def test_direct_of_a_singular_problem_ends_at_rounding(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_direct_never_exchanges_rows_with_equal_limits(seed):
-    rng, m = np.random.default_rng(seed), 20
-    a, b = spd(rng, m, 1.0), rng.normal(size=m)
+    rng = np.random.default_rng(seed)
+    m = 20
+    a = spd(rng, m, 1.0)
+    b = rng.normal(size=m)
     fixed = np.where(np.arange(m) % 2 == 0, rng.normal(size=m), np.nan)
-    low, high = np.where(np.isnan(fixed), 0.0, fixed), np.where(np.isnan(fixed), np.inf, fixed)
+    low = np.where(np.isnan(fixed), 0.0, fixed)
+    high = np.where(np.isnan(fixed), np.inf, fixed)
     solution = lv.solve(lv.Problem.lcp(a, 3.0 * b, low, high), "direct", tol=1e-12)
     assert solution.success and solution.work.get("pivots", 0) <= 3, str(solution)
 
@@ -252,7 +256,8 @@ def test_direct_ends_with_a_solution_or_a_proof_on_singular_problems_with_rows_o
         rng = np.random.default_rng(seed)
         m = int(rng.integers(6, 20))
         jac = rng.normal(size=(m, int(rng.integers(2, 5))))
-        lower, upper = np.where(rng.random(m) < 0.2, -np.inf, 0.0), np.where(rng.random(m) < 0.3, 1.0, np.inf)
+        lower = np.where(rng.random(m) < 0.2, -np.inf, 0.0)
+        upper = np.where(rng.random(m) < 0.3, 1.0, np.inf)
         fixed = rng.random(m) < 0.3
         lower[fixed] = upper[fixed] = rng.uniform(-1.0, 1.0, fixed.sum())
         problem = lv.Problem(rng.normal(size=m), lv.Cones.bounded(lower, upper), jac @ jac.T)

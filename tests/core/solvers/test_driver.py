@@ -34,7 +34,8 @@ def test_driver_on_contacts_has_the_bits_of_newton(friction, seed, rolling):
 @pytest.mark.parametrize("seed", range(4))
 def test_driver_of_an_asymmetric_matrix_converges_quadratically(seed):
     """With a factor of another matrix, the last step would leave an error just below the tolerance."""
-    rng, m = np.random.default_rng(seed), 12
+    rng = np.random.default_rng(seed)
+    m = 12
     half, skew = rng.normal(size=(m, m)), rng.normal(size=(m, m))
     a = half @ half.T / m + 0.3 * np.eye(m) + 0.3 * (skew - skew.T)
     problem = lv.Problem.lcp(a, 3.0 * rng.normal(size=m), -0.2, 0.5)

@@ -32,10 +32,15 @@ def exchange_bodies(problem):
     """Exchange the two bodies of every block: the normal and the first tangent turn round, the second does not."""
     rows, cones = problem.rows, problem.cones
     exchanged = replace(
-        rows, jac=np.roll(rows.jac, 6, axis=1), joint_body=rows.joint_body[:, ::-1],
-        contact_body=rows.contact_body[:, ::-1], arm_a=rows.arm_b, arm_b=rows.arm_a,
-        normal=-rows.normal, tangent=-rows.tangent,
-    )  # fmt: skip
+        rows,
+        jac=np.roll(rows.jac, 6, axis=1),
+        joint_body=rows.joint_body[:, ::-1],
+        contact_body=rows.contact_body[:, ::-1],
+        arm_a=rows.arm_b,
+        arm_b=rows.arm_a,
+        normal=-rows.normal,
+        tangent=-rows.tangent,
+    )
     sign = np.ones(problem.m)
     sign[cones.ptr[:-1][cones.n_tangents == 2] + 2] = -1.0
     sign[cones.rolling_rows[cones.rolling_rows >= 0] + 1] = -1.0
@@ -55,7 +60,9 @@ def mirror_rows(problem):
 
 def scale_units(problem, mass, speed):
     """Multiply all masses and all speeds by powers of two; impulses are then multiplied by both."""
-    rows, cones, impulse = problem.rows, problem.cones, mass * speed
+    rows = problem.rows
+    cones = problem.cones
+    impulse = mass * speed
     scaled = replace(
         rows, inv_mass=rows.inv_mass / mass, inv_inertia=rows.inv_inertia / mass, v_free=speed * rows.v_free
     )
@@ -108,13 +115,33 @@ def test_equivalent_problem_takes_the_same_iterations_to_the_equivalent_answer(l
 
 #: Unit of each number of a residual, a motion error and a gradient by the final velocities: powers of mass and speed.
 UNITS = {
-    "relative": (0, 0), "roundoff_floor": (0, 0), "excess": (0, 0), "above_floor": (0, 0), "energy": (0.5, 1),
-    "energy_at_zero": (0.5, 1), "floor_energy": (0.5, 1), "energy_rhs": (0.5, 1), "velocity": (0, 1),
-    "velocity_at_zero": (0, 1), "velocity_by_row": (0, 1), "error": (1, 1), "slack": (0, 1),
-    "kinetic": (0.5, 1), "speed": (0, 1), "spin": (0, 1), "rows": (0, 1), "margin": (1, 1),
-    "target": (0, 0), "v_free": (0, 0), "compliance": (1, 1), "mu": (0, 1), "patch_radius": (0, 1), "rolling": (0, 1),
-    "lower": (-1, 0), "upper": (-1, 0),
-}  # fmt: skip
+    "relative": (0, 0),
+    "roundoff_floor": (0, 0),
+    "excess": (0, 0),
+    "above_floor": (0, 0),
+    "energy": (0.5, 1),
+    "energy_at_zero": (0.5, 1),
+    "floor_energy": (0.5, 1),
+    "energy_rhs": (0.5, 1),
+    "velocity": (0, 1),
+    "velocity_at_zero": (0, 1),
+    "velocity_by_row": (0, 1),
+    "error": (1, 1),
+    "slack": (0, 1),
+    "kinetic": (0.5, 1),
+    "speed": (0, 1),
+    "spin": (0, 1),
+    "rows": (0, 1),
+    "margin": (1, 1),
+    "target": (0, 0),
+    "v_free": (0, 0),
+    "compliance": (1, 1),
+    "mu": (0, 1),
+    "patch_radius": (0, 1),
+    "rolling": (0, 1),
+    "lower": (-1, 0),
+    "upper": (-1, 0),
+}
 
 
 def list_numbers(problem, impulse, solution):

@@ -41,9 +41,22 @@ print(json.dumps([{name: sorted(of) for name, of in seen.items()}, names, lv.reg
 
 #: Backends and what draws, reads files or prints: what a listing must not load.
 HEAVY = {
-    "matplotlib", "h5py", "qpsolvers", "osqp", "clarabel", "piqp", "daqp", "quadprog", "scs", "pandas", "proxsuite",
-    "highspy", "qpalm", "rich", "click",
-}  # fmt: skip
+    "matplotlib",
+    "h5py",
+    "qpsolvers",
+    "osqp",
+    "clarabel",
+    "piqp",
+    "daqp",
+    "quadprog",
+    "scs",
+    "pandas",
+    "proxsuite",
+    "highspy",
+    "qpalm",
+    "rich",
+    "click",
+}
 
 
 def test_import_of_the_package_loads_only_needed_modules():

@@ -19,7 +19,8 @@ def equality_program(seed):
     """A convex program of n >= 0 under equalities: the free multipliers have a zero block, and A is not symmetric."""
     rng = np.random.default_rng(seed)
     n, k = int(rng.integers(3, 12)), int(rng.integers(1, 3))
-    g, e = rng.normal(size=(n, n // 2)), rng.normal(size=(k, n))
+    g = rng.normal(size=(n, n // 2))
+    e = rng.normal(size=(k, n))
     a = np.block([[g @ g.T, -e.T], [e, np.zeros((k, k))]])
     x = np.append(np.maximum(rng.normal(size=n), 0.0), rng.normal(size=k))
     w = np.append(np.where(x[:n] > 0.0, 0.0, rng.random(n)), np.zeros(k))
@@ -83,9 +84,11 @@ def test_lemke_of_a_cyclic_matrix_whose_ratios_are_all_equal_ends_in_one_path(n,
 @pytest.mark.parametrize("seed", range(6))
 def test_lemke_proves_that_free_and_bounded_rows_contradict_in_one_path(seed):
     """A y = 0 and b.y > 0, with y of both signs on the free rows."""
-    rng, m = np.random.default_rng(seed), 8
+    rng = np.random.default_rng(seed)
+    m = 8
     y = np.r_[rng.normal(size=3), rng.uniform(0.5, 1.0, 5)]
-    half, b = rng.normal(size=(m, m - 1)), rng.normal(size=m)
+    half = rng.normal(size=(m, m - 1))
+    b = rng.normal(size=m)
     half -= np.outer(y, y @ half) / (y @ y)
     b += y * (0.5 - b @ y) / (y @ y)
     solution = lv.solve(lv.Problem.lcp(half @ half.T, b, np.r_[np.full(3, -np.inf), np.zeros(5)], np.inf), "lemke")

@@ -19,21 +19,27 @@ def worlds(n, m=12, nv=18, seed=0, dtype=np.float64):
     root = rng.standard_normal((n, nv, nv))
     mass = root @ root.transpose(0, 2, 1) / nv + np.eye(nv)
     mass = (mass + mass.transpose(0, 2, 1)) / 2
-    jac, free = rng.standard_normal((n, m, nv)), rng.standard_normal((n, nv))
+    jac = rng.standard_normal((n, m, nv))
+    free = rng.standard_normal((n, nv))
     return jac.astype(dtype), mass.astype(dtype), free.astype(dtype)
 
 
 def assert_same(many, i, single):
     """The arrays and the Solution of world i have the bits of a single solve."""
-    own, found = many[i], single.residual
+    own = many[i]
+    found = single.residual
     assert own.impulse.tobytes() == single.impulse.tobytes()
     for name in ("relative", "energy", "velocity", "roundoff_floor", "worst_row", "energy_at_zero", "velocity_at_zero"):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
     assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)
     assert (many.relative[i], many.energy[i], many.velocity_error[i], many.roundoff_floor[i], many.worst_row[i]) == (
-        found.relative, found.energy, found.velocity, found.roundoff_floor, found.worst_row,
-    )  # fmt: skip
+        found.relative,
+        found.energy,
+        found.velocity,
+        found.roundoff_floor,
+        found.worst_row,
+    )
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work) == (single.message, single.work)
@@ -72,23 +78,30 @@ def triangles(mass):
 def stacked(law="coulomb", dtype=np.float64, n=20):
     """Worlds of one size in arrays; "own mu": each with friction coefficients of its own."""
     jac, mass, free = worlds(n, dtype=dtype)
-    target, soft = np.linspace(0.0, 0.2, 12), np.full((n, 12), 0.01)
+    target = np.linspace(0.0, 0.2, 12)
+    soft = np.full((n, 12), 0.01)
     cones = lv.Cones.contacts(0.0, tangents=0, count=12) if law == "lcp" else DISKS
     mu = np.random.default_rng(1).uniform(0.0, 1.0, (n, 4)) if law == "own mu" else None
     friction = "cone" if law == "cone" else "coulomb"
     batch = lv.Batch(jac, mass, free, target=target, cones=cones, compliance=soft, mu=mu, friction=friction)
     return batch, [
         lv.Problem.from_jacobian(
-            jac[i], mass[i], free[i], target=target, cones=cones if mu is None else lv.Cones.contacts(mu[i]),
-            compliance=soft[i], friction=friction,
+            jac[i],
+            mass[i],
+            free[i],
+            target=target,
+            cones=cones if mu is None else lv.Cones.contacts(mu[i]),
+            compliance=soft[i],
+            friction=friction,
         )
         for i in range(n)
-    ]  # fmt: skip
+    ]
 
 
 def laid_out(layout):
     """Worlds of 0 to 4 contacts: padded, views of wider arrays, ragged by rows, by entries, triangles of M."""
-    n, (jac, mass, free) = 9, worlds(9)
+    n = 9
+    (jac, mass, free) = worlds(9)
     rows = 3 * np.array([4, 1, 0, 2, 4, 3, 0, 1, 2])
     ptr = np.concatenate([[0], np.cumsum(rows)])
     each = [lv.Cones.contacts(0.4 + 0.01 * i, count=r // 3) for i, r in enumerate(rows)]
@@ -100,17 +113,22 @@ def laid_out(layout):
     whole = lv.Cones(
         ptr=np.concatenate([[0], *(c.ptr[1:] + at for c, at in zip(each, ptr, strict=False))]),
         **{k: np.concatenate([getattr(c, k) for c in each]) for k in ("kind", "lower", "upper", "mu", "patch_radius")},
-    )  # fmt: skip
+    )
     make = {
         "padded": lambda: lv.Batch(jac, mass, free, target=target, cones=each, count=rows),
         "strided": lambda: lv.Batch(wide[:, :12, :18], mass, free, target=target, cones=whole, count=rows),
         "rows": lambda: lv.Batch(flat, mass, free, target=goal, cones=whole, row_ptr=ptr),
         "triangles": lambda: lv.Batch(flat, triangles(mass), free, target=goal, cones=whole, row_ptr=ptr),
         "entries": lambda: lv.Batch(
-            flat.ravel(), mass.ravel(), free.ravel(), target=goal, cones=each, row_ptr=ptr,
+            flat.ravel(),
+            mass.ravel(),
+            free.ravel(),
+            target=goal,
+            cones=each,
+            row_ptr=ptr,
             velocity_ptr=18 * np.arange(n + 1),
         ),
-    }  # fmt: skip
+    }
     return make[layout](), [
         lv.Problem.from_jacobian(jac[i, :r], mass[i], free[i], target=target[i, :r], cones=each[i])
         for i, r in enumerate(rows)
@@ -139,12 +157,11 @@ def with_zeros_that_come_and_go(step):
 
 
 def of_several_sizes():
-    small, large = worlds(3, 6, 7), worlds(2, 6, 11, seed=4)
+    small = worlds(3, 6, 7)
+    large = worlds(2, 6, 11, seed=4)
     jac, mass, free = (np.concatenate([x.ravel(), y.ravel()]) for x, y in zip(small, large, strict=True))
-    cones, ptr = (
-        lv.Cones.contacts(0.3, count=2),
-        {"row_ptr": 6 * np.arange(6), "velocity_ptr": [0, 7, 14, 21, 32, 43]},
-    )
+    cones = lv.Cones.contacts(0.3, count=2)
+    ptr = {"row_ptr": 6 * np.arange(6), "velocity_ptr": [0, 7, 14, 21, 32, 43]}
     return lv.Batch(jac, mass, free, cones=cones, friction="cone", **ptr), [
         lv.Problem.from_jacobian(*(x[i] for x in given), cones=cones, friction="cone")
         for given, n in ((small, 3), (large, 2))
@@ -165,42 +182,56 @@ def ill_conditioned():
 def boxes(friction):
     """Return stacks of two boxes of different masses, friction and targets, as bodies."""
     rng = np.random.default_rng(5)
-    corners, up = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), np.array([0.0, 0.0, 0.5])
+    corners = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    up = np.array([0.0, 0.0, 0.5])
     single = [
         lv.Problem.from_rows(
             lv.Rows(
-                inv_mass=rng.uniform(0.5, 2.0, 2), inv_inertia=np.tile(6.0 * np.eye(3), (2, 1, 1)),
+                inv_mass=rng.uniform(0.5, 2.0, 2),
+                inv_inertia=np.tile(6.0 * np.eye(3), (2, 1, 1)),
                 v_free=[0.3, 0.0, -0.16, 0.0, 0.0, 0.0] + 0.05 * rng.standard_normal((2, 6)),
-                contact_body=np.repeat([(-1, 0), (0, 1)], 4, axis=0), normal=np.tile([0.0, 0.0, 1.0], (8, 1)),
-                tangent=np.tile([1.0, 0.0, 0.0], (8, 1)), arm_a=np.tile(corners + up, (2, 1)),
+                contact_body=np.repeat([(-1, 0), (0, 1)], 4, axis=0),
+                normal=np.tile([0.0, 0.0, 1.0], (8, 1)),
+                tangent=np.tile([1.0, 0.0, 0.0], (8, 1)),
+                arm_a=np.tile(corners + up, (2, 1)),
                 arm_b=np.tile(corners - up, (2, 1)),
             ),
-            mu=rng.uniform(0.1, 1.0, 8), friction=friction, compliance=0.01, target=0.1 * rng.standard_normal(24),
+            mu=rng.uniform(0.1, 1.0, 8),
+            friction=friction,
+            compliance=0.01,
+            target=0.1 * rng.standard_normal(24),
         )
         for _ in range(6)
-    ]  # fmt: skip
+    ]
     return single, single
 
 
 def listed():
     """Problems of several forms and precisions; those of J and M take the compiled loop of batches."""
     single = [
-        *stacked(n=3)[1], *stacked(dtype=np.float32, n=2)[1], lv.Problem.lcp(np.eye(2), [1.0, -1.0]),
+        *stacked(n=3)[1],
+        *stacked(dtype=np.float32, n=2)[1],
+        lv.Problem.lcp(np.eye(2), [1.0, -1.0]),
         lv.Problem.contact(2.0 * np.eye(3), [1.0, 0.5, 0.0], 0.3),
-    ]  # fmt: skip
+    ]
     return single, single
 
 
 #: Batches and the same problems one by one.
 BATCHES = {
-    **{f"{law}, {x.__name__}": lambda law=law, x=x: stacked(law, x) for law in ("lcp", "coulomb", "cone", "own mu")
-       for x in (np.float64, np.float32)},
+    **{
+        f"{law}, {x.__name__}": lambda law=law, x=x: stacked(law, x)
+        for law in ("lcp", "coulomb", "cone", "own mu")
+        for x in (np.float64, np.float32)
+    },
     **{name: lambda name=name: laid_out(name) for name in ("padded", "strided", "rows", "triangles", "entries")},
     **{f"zeros of M, {x.__name__}": lambda x=x: with_zeros(x) for x in (np.float64, np.float32)},
     **{f"zeros of M by {k}": lambda k=k: with_zeros_that_come_and_go(k) for k in (1, -1)},
-    "several sizes": of_several_sizes, "ill-conditioned M": ill_conditioned, "a list": listed,
+    "several sizes": of_several_sizes,
+    "ill-conditioned M": ill_conditioned,
+    "a list": listed,
     **{f"bodies, {law}": lambda law=law: boxes(law) for law in ("coulomb", "cone")},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BATCHES)
@@ -227,9 +258,13 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
         for i, (problem, impulse) in enumerate(zip(single, impulses, strict=True)):
             one = lv.residual(problem, impulse, precision=precision)
             assert (one.relative, one.energy, one.velocity, one.worst_row, one.verdict, one.roundoff_floor) == (
-                found.relative[i], found.energy[i], found.velocity_error[i], found.worst_row[i], found.verdict[i],
+                found.relative[i],
+                found.energy[i],
+                found.velocity_error[i],
+                found.worst_row[i],
+                found.verdict[i],
                 found.roundoff_floor[i],
-            )  # fmt: skip
+            )
             own = found[i]
             assert (str(own), own.verdict, own.rounding) == (str(one), one.verdict, one.rounding)
             for field in dataclasses.fields(one):
@@ -282,9 +317,12 @@ def spoiled(jac, mass, free, mu):
     mass[7, 0, 1] += 1e-3  # not symmetric
     free[8, 3] = np.inf
     return {
-        2: "J must be finite", 4: "not positive definite", 5: "mu must not be negative", 7: "not symmetric",
+        2: "J must be finite",
+        4: "not positive definite",
+        5: "mu must not be negative",
+        7: "not symmetric",
         8: "v_free",
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -361,7 +399,8 @@ def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(list
         np.testing.assert_allclose(impulse[i], project_impulse(DISKS, start[i]), rtol=1e-15)
         np.testing.assert_allclose(impulse[i], start[i], rtol=1e-11)
         assert many.iterations[i] == 0
-    again, inside = start.copy(), [0, 1, 3, 5]
+    again = start.copy()
+    inside = [0, 1, 3, 5]
     again[inside] = impulse[inside].reshape(again[inside].shape)
     starts = {"impulses" if listed else "impulse": again}
     again = lv.solve_many(given, tol=1e-8, errors="status", **starts).impulse.reshape(6, -1)

@@ -32,10 +32,12 @@ def test_newton_interior_point_with_more_rows_than_velocities_takes_no_more_step
     """Its first point leaves out what H cannot reach: that was a million times the rest, and shifted every cone."""
     rng = np.random.default_rng(seed)
     nv, m = 20, 180
-    jac, moves = rng.normal(size=(m, nv)), rng.exponential(1.0, m) * (rng.random(m) < 0.6)
+    jac = rng.normal(size=(m, nv))
+    moves = rng.exponential(1.0, m) * (rng.random(m) < 0.6)
     cones = lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
     if friction:
-        cones, moves.reshape(-1, 3)[:, 1:] = lv.Cones.contacts(rng.uniform(0.1, 1.0, m // 3)), 0.0
+        cones = lv.Cones.contacts(rng.uniform(0.1, 1.0, m // 3))
+        moves.reshape(-1, 3)[:, 1:] = 0.0
     b = jac @ rng.normal(size=nv) - moves  # met by a motion
     problem = lv.Problem(b, cones, jac @ jac.T, friction="cone")
     solution = lv.solve(problem, "newton", tol=1e-6, max_iter=25)  # measured: 8 to 21
@@ -51,8 +53,11 @@ def test_newton_interior_point_with_more_rows_than_velocities_takes_no_more_step
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10)
     system = system_in(problem, "velocity" if form == "augmented" else form)
-    solve, arrays = system.solve, system.solve.view_arrays()
-    m, g, eps = arrays.m, arrays.g, 1e-3
+    solve = system.solve
+    arrays = system.solve.view_arrays()
+    m = arrays.m
+    g = arrays.g
+    eps = 1e-3
     rng = np.random.default_rng(seed)
     z, dz = rng.normal(size=m), rng.normal(size=m)
     solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
@@ -115,7 +120,8 @@ def test_newton_exchanges_in_a_cycle_end_by_count(n):
 
 def on_bodies(k, layout, lu, wide=True):
     """Newton's method whose H is K K^T, K (rows, 2, s) of the bodies `layout.node`, on rows of any problem."""
-    m, s = len(k), layout.s
+    m = len(k)
+    s = layout.s
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))
     panel = np.zeros((m, 2, 6))
     panel[:, :, :s] = np.where(layout.swapped[:, None, None] > 0, k[:, ::-1], k)
@@ -128,7 +134,8 @@ def on_bodies(k, layout, lu, wide=True):
 def random_columns(rng, node, n, s):
     """K of rows between bodies, and the same as a matrix (rows, n s)."""
     m = len(node)
-    k, whole = rng.normal(size=(m, 2, s)), np.zeros((m, n * s))
+    k = rng.normal(size=(m, 2, s))
+    whole = np.zeros((m, n * s))
     k[node[:, 1] < 0, 1] = 0.0
     for i, pair in enumerate(node):
         for half, body in enumerate(pair):
@@ -150,7 +157,8 @@ def test_factor_of_a_graph_of_bodies_solves_as_a_dense_matrix(s, n, m):
     if n > 3:
         assert layout.supernodes < n and 0 < layout.swapped.sum() < len(body)
     k, whole = random_columns(rng, layout.node, n, s)
-    v, r = rng.uniform(0.1, 10.0, m), rng.normal(size=m)
+    v = rng.uniform(0.1, 10.0, m)
+    r = rng.normal(size=m)
     expected = np.linalg.solve(np.diag(1.0 / v) + whole @ whole.T, r)
     for what in ("barrier", "pair"):
         outs = set()
@@ -168,7 +176,8 @@ def test_factor_of_a_graph_of_bodies_solves_as_a_dense_matrix(s, n, m):
 def sparse_rows(seed, m=500, even=True, near=3):
     """Bounded rows of a matrix with few entries, some of them in one row alone where it is not even."""
     rng = np.random.default_rng(seed)
-    i, j = np.arange(m).repeat(near), rng.integers(0, m, near * m)
+    i = np.arange(m).repeat(near)
+    j = rng.integers(0, m, near * m)
     x, y = rng.normal(size=(2, near * m))
     if even:
         a = sp.coo_array((np.r_[x, x], (np.r_[i, j], np.r_[j, i])), shape=(m, m))
@@ -185,7 +194,9 @@ def sparse_rows(seed, m=500, even=True, near=3):
 def test_newton_solves_sparse_free_rows_together_with_all_rows(even, seed):
     problem = sparse_rows(seed, 200, even)
     system = system_in(problem, "sparse")
-    h, rng, eps = dense_h(problem), np.random.default_rng(seed), 1e-6
+    h = dense_h(problem)
+    rng = np.random.default_rng(seed)
+    eps = 1e-6
     free = rng.random(200) < 0.6
     r = rng.normal(size=200)
     system.solve.view_arrays().p[:] = free
@@ -202,7 +213,8 @@ def test_newton_without_friction_equals_the_cone_law_without_coulomb_rounds(form
     p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
     p = replace(p, compliance=np.zeros(p.m), cones=replace(p.cones, mu=np.zeros(p.n_blocks)))
     problem = FORMS[form](p)
-    coulomb, cone = lv.solve(problem, "newton"), lv.solve(problem.relaxed("cone"), "newton")
+    coulomb = lv.solve(problem, "newton")
+    cone = lv.solve(problem.relaxed("cone"), "newton")
     assert coulomb.claim_check == "confirmed" and "Coulomb rounds" not in coulomb.work
     assert coulomb.status == cone.status
     assert np.array_equal(coulomb.impulse, cone.impulse)
@@ -211,7 +223,9 @@ def test_newton_without_friction_equals_the_cone_law_without_coulomb_rounds(form
 def pinched(seed, form, **kind):
     """Rigid contacts of the cone's law in four pairs, the two sides of one body, b >= 0.1 m/s along both normals."""
     p = random_contact_problem(seed, "cone", bodies=3, joints=2, contacts=8, **kind)
-    rows, b, first = p.rows, p.b.copy(), p.cones.normal_rows
+    rows = p.rows
+    b = p.b.copy()
+    first = p.cones.normal_rows
     sides = {
         key: np.repeat(getattr(rows, key)[::2], 2, axis=0)
         for key in ("normal", "tangent", "arm_a", "arm_b", "contact_body")
@@ -239,8 +253,11 @@ def test_cones_without_a_solution_are_proven_to_have_none(form, kind):
 @given(seed=seeds)
 def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
     """b = A lambda - w with lambda in the cone and w in its dual: for w.y >= 0 = lambda.A y no y proves anything."""
-    p, rng = pinched(seed, "rows", tangents=2, spin=False), np.random.default_rng(seed)
-    contacts, mu, normal = p.cones.contact_rows, p.cones.mu[p.cones.kind != ROW], p.cones.normal_rows
+    p = pinched(seed, "rows", tangents=2, spin=False)
+    rng = np.random.default_rng(seed)
+    contacts = p.cones.contact_rows
+    mu = p.cones.mu[p.cones.kind != ROW]
+    normal = p.cones.normal_rows
     lam, w = np.zeros(p.m), np.zeros(p.m)
     lam[contacts], w[contacts] = rng.normal(size=(2, contacts.sum()))
     lam[normal] = rng.uniform(0.0, 2.0, 8) + np.hypot(lam[normal + 1], lam[normal + 2]) / mu
@@ -290,7 +307,8 @@ def draw_generalized_contacts(seed, nv, contacts, trees=1):
 @pytest.mark.parametrize("seed", range(5))
 def test_newton_coulomb_jacobian_with_few_rows_equals_matrix(seed):
     problem = draw_generalized_contacts(seed, 20, 6)
-    solution, expected = lv.solve(problem, "newton", tol=1e-10), lv.solve(as_matrix(problem), "newton", tol=1e-10)
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    expected = lv.solve(as_matrix(problem), "newton", tol=1e-10)
     assert solution.success and expected.success
     assert "Coulomb rounds" not in solution.work
     # Both run the same steps on the same matrix, up to rounding.
@@ -313,7 +331,8 @@ def test_newton_coulomb_jacobian_with_sparse_matrix_steps_over_rows(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_newton_jacobian_with_two_bounds_takes_few_steps(seed):
     rng = np.random.default_rng(seed)
-    jac, bound = rng.normal(size=(30, 60)), rng.uniform(0.1, 2.0, 30)
+    jac = rng.normal(size=(30, 60))
+    bound = rng.uniform(0.1, 2.0, 30)
     cones = lv.Cones.bounded(-bound, bound)
     problem = lv.Problem.from_jacobian(jac, np.eye(60), rng.normal(size=60), cones=cones)
     solution = lv.solve(problem, "newton", tol=1e-9)
@@ -346,13 +365,12 @@ def test_newton_of_cones_takes_as_many_steps_for_every_kind_of_contact(kind, for
 def test_newton_of_cones_takes_as_many_steps_for_upper_limits_as_for_lower_ones(form):
     for seed in range(8, 16):
         bodies = add_compliance(CONTACTS["disks"](seed, "cone", joints=8), 0.001)
-        cones, is_joint = bodies.cones, ~bodies.cones.contact_rows
+        cones = bodies.cones
+        is_joint = ~bodies.cones.contact_rows
         steps = []
         for sign in (1.0, -1.0):
             low, high = (-np.inf, 0.01 * (1 + seed)) if sign > 0.0 else (-0.01 * (1 + seed), np.inf)
-            limits = {
-                "lower": np.where(is_joint, low, cones.lower), "upper": np.where(is_joint, high, cones.upper)
-            }  # fmt: skip
+            limits = {"lower": np.where(is_joint, low, cones.lower), "upper": np.where(is_joint, high, cones.upper)}
             turned = {"rows": replace(bodies.rows, jac=sign * bodies.rows.jac), "cones": replace(cones, **limits)}
             problem = replace(bodies, b=np.where(is_joint, sign, 1.0) * bodies.b, **turned)
             steps.append(lv.solve(FORMS[form](problem), "newton", tol=1e-9).iterations)
@@ -363,9 +381,12 @@ def test_newton_of_cones_takes_as_many_steps_for_upper_limits_as_for_lower_ones(
 def test_newton_solves_a_chain_of_joints_directly_from_a_warm_start(compliance):
     n = 8
     builder = lv.RowBuilder(
-        np.ones(n), [0.4 * np.eye(3)] * n, np.tile([0.0, 0.0, -0.1, 0.02, 0.01, 0.0], (n, 1)), 0.01,
+        np.ones(n),
+        [0.4 * np.eye(3)] * n,
+        np.tile([0.0, 0.0, -0.1, 0.02, 0.01, 0.0], (n, 1)),
+        0.01,
         position=[(i + 0.5, 0.0, 0.0) for i in range(n)],
-    )  # fmt: skip
+    )
     for i in range(n):
         builder.ball(i - 1, i, (float(i), 0.0, 0.0))
     problem = builder.problem()
@@ -392,12 +413,16 @@ def test_newton_over_velocities_with_coulomb_friction_takes_few_steps():
 @pytest.mark.parametrize("softest", [-3.0, 1.0])
 def test_newton_needs_no_more_factorisations_for_unequal_compliances_of_a_contact(law, softest):
     """The two tangents of a contact share the regularisation with which friction is on a circle."""
-    steps, fallbacks = [0, 0], 0
+    steps = [0, 0]
+    fallbacks = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         n, contacts = int(rng.integers(3, 8)), int(rng.integers(1, 5))
-        half, jac, free = rng.normal(size=(n, n)), rng.normal(size=(3 * contacts, n)), rng.normal(size=n)
-        mu, soft = rng.uniform(0.2, 1.0, contacts), 10.0 ** rng.uniform(softest - 2.0, softest, 3 * contacts)
+        half = rng.normal(size=(n, n))
+        jac = rng.normal(size=(3 * contacts, n))
+        free = rng.normal(size=n)
+        mu = rng.uniform(0.2, 1.0, contacts)
+        soft = 10.0 ** rng.uniform(softest - 2.0, softest, 3 * contacts)
         for k, own in enumerate((soft, np.full(3 * contacts, soft.min()))):
             problem = lv.Problem.from_jacobian(
                 jac, half @ half.T + np.eye(n), free, cones=lv.Cones.contacts(mu, 2), compliance=own, friction=law

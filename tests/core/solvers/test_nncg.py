@@ -26,7 +26,8 @@ def sliding_pile():
 def test_nncg_first_iterations_equal_a_dense_twin(restart, kept):
     """Iterations of nncg against the formulas written in NumPy over single sweeps of pgs."""
     problem = random_lcp(5, m=9) if restart == "growth" else sliding_pile()
-    d, count = problem.d, 0
+    d = problem.d
+    count = 0
 
     x = problem.start()
     p = norm = None
@@ -72,7 +73,9 @@ def test_anderson_first_iterations_are_least_squares_over_the_last_sweeps(memory
     a = rng.standard_normal((8, 12))
     problem = lv.Problem.linear(a @ a.T + np.eye(8), rng.standard_normal(8))
     root = np.sqrt(problem.d)
-    x, ys, fs = problem.start(), [], []
+    x = problem.start()
+    ys = []
+    fs = []
     for k in range(5):
         y = sweeps(problem, "pgs", 1, impulse=x)
         got = lv.solve(problem, "anderson", memory=memory, tol=0.0, max_iter=k + 1).impulse

@@ -13,17 +13,26 @@ from lavender.problem.ordering import SWEEP_ORDERS
 
 #: Values of options; every two of them mean different iterations. A number without a line gets its default and half.
 VALUES = {
-    "order": tuple(SWEEP_ORDERS), "seed": (1, 2), "ground": ([0, 1], [5]), "memory": (2, 5), "relaxation": (1.0, 1.7),
-    "omega": (0.1, 0.2), "sweep": ("pgs", "blocks"), "convex": (0, 3), "restart": ("growth", "against"),
+    "order": tuple(SWEEP_ORDERS),
+    "seed": (1, 2),
+    "ground": ([0, 1], [5]),
+    "memory": (2, 5),
+    "relaxation": (1.0, 1.7),
+    "omega": (0.1, 0.2),
+    "sweep": ("pgs", "blocks"),
+    "convex": (0, 3),
+    "restart": ("growth", "against"),
     "form": ("velocity", "impulse"),
-}  # fmt: skip
+}
 NEEDED = {"seed": {"order": "random"}, "ground": {"order": "bottom_up"}}
 SPECS = {name: registry.get(name) for name in lv.available(external=False)}
 #: Bodies show which of them are the ground, so that solvers of bodies only refuse `ground`.
 LISTED = [
-    (name, option) for name, s in SPECS.items() for option in sorted(s.accepts)
+    (name, option)
+    for name, s in SPECS.items()
+    for option in sorted(s.accepts)
     if (option, s.operators) != ("ground", {"rows"})
-]  # fmt: skip
+]
 
 
 def get_values(name, option):

@@ -85,7 +85,8 @@ def test_solve_to_a_velocity_error_meets_it_on_every_row(name, velocity_tol):
 
 
 def test_velocity_tol_of_masses_times_1000_and_speeds_times_10_takes_the_same_sweeps():
-    A, b = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, 0.5])
+    A = np.array([[2.0, 1.0], [1.0, 2.0]])
+    b = np.array([1.0, 0.5])
     own = lv.solve(lv.Problem.lcp(A, b), "pgs", velocity_tol=1e-4)
     assert own.iterations == lv.solve(lv.Problem.lcp(A / 1000.0, 10.0 * b), "pgs", velocity_tol=1e-3).iterations
 
@@ -135,7 +136,8 @@ def test_opposed_limits_that_contradict_each_other_leave_no_impulse_worse_than_z
         rng = np.random.default_rng(seed)
         n = int(rng.integers(2, 5))
         limit = rng.normal(size=(1, n))
-        jac, ends = np.vstack([rng.normal(size=(2, n)), limit, -limit]), np.full(4, np.inf)
+        jac = np.vstack([rng.normal(size=(2, n)), limit, -limit])
+        ends = np.full(4, np.inf)
         general = lv.Problem.from_jacobian(
             jac, np.eye(n), rng.normal(size=n), target=[0.0, 0.0, 5.0, 5.0], cones=lv.Cones.bounded(np.zeros(4), ends)
         )

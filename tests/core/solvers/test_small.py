@@ -47,21 +47,37 @@ def draw(kind, seed):
 
 def hollow(problem, rng):
     """Some of its rows of A all zero: rows of J, and the compliance of these."""
-    general, soft = problem.generalized, problem.compliance.copy()
+    general = problem.generalized
+    soft = problem.compliance.copy()
     jac = general.jac.toarray()
     rows = rng.random(problem.m) < 0.3
     jac[rows] = soft[rows] = 0.0
     target = np.where(rows, rng.choice([-1.0, -1e-3, 0.0, 0.2], problem.m), problem.b)
     return lv.Problem.from_jacobian(
-        jac, general.mass, general.v_free, target=target + jac @ general.v_free, cones=problem.cones,
-        compliance=soft, friction=problem.friction,
-    )  # fmt: skip
+        jac,
+        general.mass,
+        general.v_free,
+        target=target + jac @ general.v_free,
+        cones=problem.cones,
+        compliance=soft,
+        friction=problem.friction,
+    )
 
 
 KINDS = (
-    "lcp", "linear", "singular", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone",
-    "general coulomb", "general cone", "hollow coulomb", "hollow cone",
-)  # fmt: skip
+    "lcp",
+    "linear",
+    "singular",
+    "one-sided",
+    "rows coulomb",
+    "rows cone",
+    "matrix coulomb",
+    "matrix cone",
+    "general coulomb",
+    "general cone",
+    "hollow coulomb",
+    "hollow cone",
+)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -96,7 +112,8 @@ def test_first_solve_of_rows_that_nothing_moves_has_the_result_of_later_ones(kin
 @pytest.mark.parametrize("limit", [None, 10.0])
 def test_impulses_that_cancel_in_rounding_are_diverged_with_any_limit(limit):
     """Two fixed impulses that cancel in a free row, whose b is 1000 times their rounding 2^-53 A lambda."""
-    low, high = [1.5, -1.5, -np.inf], [1.5, -1.5, np.inf]
+    low = [1.5, -1.5, -np.inf]
+    high = [1.5, -1.5, np.inf]
     held = lv.Problem.lcp(np.full((3, 3), 1e13), [0.0, 0.0, 1.0], low, high)
     solution = lv.solve(held, time_limit=limit)
     assert solution.residual.relative == solution.residual.roundoff_floor > 1e-3
@@ -153,18 +170,25 @@ def test_islands_of_bodies_with_joints_are_one_call(law, seed):
 def test_islands_that_share_an_immovable_body_are_one_call(law):
     """Columns on the ground, which is a body without inverse mass: it belongs to every island."""
     columns = stacks(4, 4, 0.4, False, 3).relaxed(law)
-    rows, b = columns.rows, columns.b + 0.1 * np.random.default_rng(0).normal(size=columns.m)
+    rows = columns.rows
+    b = columns.b + 0.1 * np.random.default_rng(0).normal(size=columns.m)
 
     def put_first(ground, values):
         return np.concatenate([np.full((1, *values.shape[1:]), ground), values])
 
     on_body = replace(
-        columns, b=b, rows=replace(
-            rows, inv_mass=put_first(0.0, rows.inv_mass), inv_inertia=put_first(0.0, rows.inv_inertia),
-            v_free=put_first(0.0, rows.v_free), contact_body=rows.contact_body + 1,
+        columns,
+        b=b,
+        rows=replace(
+            rows,
+            inv_mass=put_first(0.0, rows.inv_mass),
+            inv_inertia=put_first(0.0, rows.inv_inertia),
+            v_free=put_first(0.0, rows.v_free),
+            contact_body=rows.contact_body + 1,
         ),
-    )  # fmt: skip
-    found, expected = check(on_body, "auto"), check(replace(columns, b=b), "auto")
+    )
+    found = check(on_body, "auto")
+    expected = check(replace(columns, b=b), "auto")
     assert found.success and found.message == expected.message and "on 4 islands" in found.message
     np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-6)  # The bodies have another order.
 
@@ -173,7 +197,8 @@ def test_compiled_call_on_an_island_at_rest_returns_zero():
     """Of nine islands one leaves the ground: nothing is to be done for it, and the solution says what was done."""
     rng = np.random.default_rng(3)
     g = rng.normal(size=(12, 6))
-    part, n = g @ g.T, 9
+    part = g @ g.T
+    n = 9
     b = np.tile(part @ np.tile([1.0, 0.1, 0.1], 4), n)
     problem = lv.Problem.contact(np.kron(np.eye(n), part), b, np.full(4 * n, 0.5))
     start = lv.solve(problem).impulse

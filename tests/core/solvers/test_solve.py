@@ -25,7 +25,10 @@ TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 @pytest.mark.parametrize("solver", ["pgs", "auto"])
 def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
-    n, begun, solve, hand = 2000, [], many.solve, loop.Worker
+    n = 2000
+    begun = []
+    solve = many.solve
+    hand = loop.Worker
 
     first = threading.Lock()
 
@@ -41,7 +44,8 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
 
     class SlowWorker:
         def __init__(self, worlds, stop):
-            self.hand, self.stop = hand(worlds, stop), stop
+            self.hand = hand(worlds, stop)
+            self.stop = stop
 
         def process_worlds(self, *args):
             if solver == "pgs":
@@ -61,12 +65,15 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
 
 def test_prepared_solve_of_another_velocity_keeps_the_targets():
     rng = np.random.default_rng(4)
-    jac, mass, target = rng.normal(size=(6, 9)), np.diag(rng.uniform(1.0, 2.0, 9)), rng.normal(size=6)
+    jac = rng.normal(size=(6, 9))
+    mass = np.diag(rng.uniform(1.0, 2.0, 9))
+    target = rng.normal(size=6)
     make = partial(lv.Problem.from_jacobian, jac, mass, target=target, mu=0.5, compliance=0.01)
     prepared = lv.prepare(make(rng.normal(size=9)))
     for _ in range(20):
         velocity = 10.0 * rng.normal(size=9)
-        own, single = prepared.solve(v_free=velocity), lv.solve(make(velocity))
+        own = prepared.solve(v_free=velocity)
+        single = lv.solve(make(velocity))
         np.testing.assert_allclose(own.impulse, single.impulse, rtol=1e-5, atol=1e-5)
         # Rounding of b does not accumulate from call to call.
         np.testing.assert_allclose(prepared.problem.b, target - jac @ velocity, rtol=0.0, atol=1e-13)
@@ -76,7 +83,8 @@ def test_prepared_solve_of_another_velocity_keeps_the_targets():
 def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_other():
     problem = lv.Problem.from_jacobian(np.eye(3), np.eye(3), -np.ones(3), mu=0.5)
     lv.solve(problem)
-    prepared, seen = lv.prepare(problem), []
+    prepared = lv.prepare(problem)
+    seen = []
     for i in range(5):
         prepared.solve(b=problem.b + 0.01 * i)
         seen.append(weakref.ref(prepared.problem))
@@ -100,7 +108,9 @@ def test_text_of_a_solution_names_its_start(name, arguments):
 
 @pytest.mark.parametrize("name", ["pgs", "newton"])
 def test_solve_of_new_problem_computes_each_check_and_array_once(name):
-    calls, folder, before = [], os.path.dirname(lv.__file__), sys.getprofile()
+    calls = []
+    folder = os.path.dirname(lv.__file__)
+    before = sys.getprofile()
 
     def record(frame, event, _):
         if event == "call" and frame.f_code.co_filename.startswith(folder):

@@ -15,7 +15,8 @@ from lavender_ext.sweep import serial
 @given(seed=seeds)
 def test_sweep_in_every_form_equals_the_dense_update(kind, seed):
     problem = CONTACTS[kind](seed)
-    lam, twin = problem.start(), judge_twin.Problem(judge_twin.spec_of(problem))
+    lam = problem.start()
+    twin = judge_twin.Problem(judge_twin.spec_of(problem))
     for _ in range(5):
         judge_twin.sweep(problem, twin, lam, range(problem.n_blocks))
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
@@ -79,7 +80,8 @@ def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
 @pytest.mark.parametrize("k", [2, 3, 5])
 def test_jacobi_without_damping_diverges_on_coincident_contacts(k):
     """k contacts at one place: A is all ones. Unprojected factor k - 1; projected from 0, period 2."""
-    a, b = np.ones((k, k)), np.ones(k)
+    a = np.ones((k, k))
+    b = np.ones(k)
     free = lv.Problem.linear(a, b)
     size = [abs(lv.solve(free, "jacobi", omega=1.0, tol=0.0, max_iter=n).slack[0]) for n in (3, 4)]
     assert size[1] / size[0] == pytest.approx(k - 1.0)
@@ -100,7 +102,8 @@ def test_jacobi_safe_damping_is_below_the_limit_of_convergence(seed):
 
 @given(seed=seeds)
 def test_jacobi_damping_is_the_same_in_every_unit(seed):
-    problem, rng = random_lcp(seed, m=12), np.random.default_rng(seed)
+    problem = random_lcp(seed, m=12)
+    rng = np.random.default_rng(seed)
     size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
     assert serial.jacobi_damping_of_matrix(other.csr_data) == pytest.approx(

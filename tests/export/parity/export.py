@@ -29,9 +29,13 @@ from lavender_ext.engine.arrays import make_array_views  # noqa: E402
 ORDERS = ("symmetric", "random", "reverse")
 #: Tolerance, iterations and options of each solver.
 SOLVED = {
-    "jacobi": [(0.0, 9, {})], "block_gauss_seidel": [(0.0, 9, {})], "anderson": [(0.0, 40, {})],
-    "nncg": [(0.0, 40, {})], "newton": [(1e-8, 100, {})], "direct": [(1e-8, 100, {})],
-}  # fmt: skip
+    "jacobi": [(0.0, 9, {})],
+    "block_gauss_seidel": [(0.0, 9, {})],
+    "anderson": [(0.0, 40, {})],
+    "nncg": [(0.0, 40, {})],
+    "newton": [(1e-8, 100, {})],
+    "direct": [(1e-8, 100, {})],
+}
 
 
 def numbers(*values):
@@ -74,7 +78,8 @@ def of_velocities():
         root[:6, :6], root[6:, 6:] = rng.normal(size=(2, 6, 6))
         mass = np.eye(12) + 0.1 * root @ root.T
         cones = lv.Cones.contacts(0.5, count=count, shape="box" if seed > 3 else "disk")
-        jac, friction = rng.normal(size=(3 * count, 12)), ("coulomb", "cone")[seed % 2]
+        jac = rng.normal(size=(3 * count, 12))
+        friction = ("coulomb", "cone")[seed % 2]
         yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=12), cones=cones, friction=friction)
 
 

@@ -24,8 +24,11 @@ def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen(
         pytest.skip(missing_requirement())
     done = subprocess.run(
         [sys.executable, str(ROOT / ".ci" / "parity"), "--quick", "--steps", "20"],
-        capture_output=True, text=True, check=False, cwd=ROOT,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [line for line in done.stdout.splitlines() if line.startswith("| ")]
     assert [row.split(" | ")[0].strip("| ") for row in rows] == ["x86_64", "aarch64", "aarch64"]

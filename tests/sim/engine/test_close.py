@@ -10,9 +10,15 @@ def test_closed_simulation_raises_and_keeps_its_settings():
         state = sim.snapshot()
         sim.step()
     calls = (
-        sim.step, sim.reset, sim.snapshot, sim.constraint_problem, sim.residual,
-        lambda: sim.restore(state), lambda: sim.set_velocity(1, (1.0, 0.0, 0.0)), lambda: sim.set_warm_start(False),
-    )  # fmt: skip
+        sim.step,
+        sim.reset,
+        sim.snapshot,
+        sim.constraint_problem,
+        sim.residual,
+        lambda: sim.restore(state),
+        lambda: sim.set_velocity(1, (1.0, 0.0, 0.0)),
+        lambda: sim.set_warm_start(False),
+    )
     for call in calls:
         with pytest.raises(lv.LavenderError, match="closed"):
             call()

@@ -19,7 +19,9 @@ def simulate(name, rate, seconds, solver="sequential_impulses", **parameters):
     """Run a scene, observed ten times a second: energies [J], drift and depth after SETTLED [m], end speed [m/s]."""
     simulation = lv.Simulation(lv.Scene(name, dt=1.0 / rate, solver=solver, **parameters))
     observation = simulation.reset()[0]
-    energies, settled, lost = [energy(simulation.scene, observation)], None, ""
+    energies = [energy(simulation.scene, observation)]
+    settled = None
+    lost = ""
     drift = depth = 0.0
     steps = round(seconds * rate)
     for step in range(1, steps + 1):
@@ -38,9 +40,15 @@ def simulate(name, rate, seconds, solver="sequential_impulses", **parameters):
     speed = np.linalg.norm(observation["velocities"][:, :3], axis=1).max()
     gain = max(energies) - energies[0]
     return SimpleNamespace(
-        lost=lost, failed=info["failed_solves"], start=energies[0], end=energies[-1], gain=gain, drift=drift,
-        depth=depth, speed=speed,
-    )  # fmt: skip
+        lost=lost,
+        failed=info["failed_solves"],
+        start=energies[0],
+        end=energies[-1],
+        gain=gain,
+        drift=drift,
+        depth=depth,
+        speed=speed,
+    )
 
 
 @pytest.mark.parametrize("rate", [60, pytest.param(120, marks=pytest.mark.nightly)])
@@ -80,9 +88,13 @@ def test_scene_energy_is_that_of_the_textbook():
     half = np.sqrt(0.5)
     scene.add_plane()
     scene.add_box(
-        (1, 2, 3), 12.0, position=(0, 0, 5), quaternion=(half, 0, 0, half), velocity=(3, 0, 4),
+        (1, 2, 3),
+        12.0,
+        position=(0, 0, 5),
+        quaternion=(half, 0, 0, half),
+        velocity=(3, 0, 4),
         angular_velocity=(0, 2, 0),
-    )  # fmt: skip
+    )
     observation = lv.Simulation(scene).reset()[0]
     expected = 0.5 * 12 * 25 + 0.5 * (4 + 9) * 4 + 12 * 10 * 5
     assert energy(scene, observation) == pytest.approx(expected, rel=1e-14)

@@ -13,10 +13,16 @@ from lavender.sim.engine.state import State
 from lavender_ext.driver import memory
 
 SCENES = {
-    "stack": {}, "pyramid": {"base": 4, "friction_shape": "box"}, "chain": {"n": 8}, "spinner": {},
-    "ramp": {"rolling_radius": 0.01}, "four_bar": {"motor": 1.0}, "bridge": {"n": 6},
-    "pile": {"n": 20, "kind": "mixed", "rolling_radius": 0.03, "patch_radius": 0.05}, "card_house": {},
-}  # fmt: skip
+    "stack": {},
+    "pyramid": {"base": 4, "friction_shape": "box"},
+    "chain": {"n": 8},
+    "spinner": {},
+    "ramp": {"rolling_radius": 0.01},
+    "four_bar": {"motor": 1.0},
+    "bridge": {"n": 6},
+    "pile": {"n": 20, "kind": "mixed", "rolling_radius": 0.03, "patch_radius": 0.05},
+    "card_house": {},
+}
 
 
 def trajectory(sim, steps):
@@ -40,7 +46,8 @@ def with_room(state, pairs, contacts):
 
 
 def restored(sim, folder):
-    state, twin = sim.snapshot(), lv.Simulation(sim.scene)
+    state = sim.snapshot()
+    twin = lv.Simulation(sim.scene)
     twin.step()
     twin.restore(state)
     return twin

@@ -13,12 +13,12 @@ def make_scene():
     second = scene.add_box(position=(1.5, 0.2, 3.0))
     scene.add_box(position=(6.0, 0.0, 0.499))
     scene.add_joint("ball", -1, first, anchor=(0.0, 0.1, 4.0))
-    scene.add_joint("hinge", first, second, anchor=(0.7, 0.0, 3.0), axis=(0.2, 1.0, 0.1), motor_speed=1.0,
-                    motor_torque=2.0)  # fmt: skip
+    scene.add_joint(
+        "hinge", first, second, anchor=(0.7, 0.0, 3.0), axis=(0.2, 1.0, 0.1), motor_speed=1.0, motor_torque=2.0
+    )
     scene.add_joint("hinge", ground, second, anchor=(1.6, 0.0, 3.0), axis=(0.0, 1.0, 0.0))
     scene.add_joint("distance", first, second, anchor_a=(0.0, 0.0, 3.4), anchor_b=(1.4, 0.1, 3.3), length=1.3)
-    scene.add_joint("distance", -1, second, anchor_a=(3.0, 0.0, 4.0), anchor_b=(2.0, 0.0, 3.3), hertz=3.0,
-                    damping=0.4)  # fmt: skip
+    scene.add_joint("distance", -1, second, anchor_a=(3.0, 0.0, 4.0), anchor_b=(2.0, 0.0, 3.3), hertz=3.0, damping=0.4)
     return scene
 
 
@@ -49,8 +49,13 @@ def rebuild(sim, state, recorded, h):
             row = rows.joint_ptr[i]
             inverse_mass = recorded.d[row] - recorded.compliance[row]  # J M^-1 J^T
             omega = 2 * np.pi * joint.hertz
-            builder.spring(*pair, *points, joint.length, stiffness=omega**2 / inverse_mass,
-                           damping=2 * joint.damping * omega / inverse_mass)  # fmt: skip
+            builder.spring(
+                *pair,
+                *points,
+                joint.length,
+                stiffness=omega**2 / inverse_mass,
+                damping=2 * joint.damping * omega / inverse_mass,
+            )
     for i, pair in enumerate(rows.contact_body):
         mu = recorded.cones.mu[rows.n_joints + i]
         builder.contact(*pair, state["point"][i], rows.normal[i], gap=state["gap"][i], mu=mu, tangent=rows.tangent[i])
@@ -70,8 +75,10 @@ def test_row_builder_rebuilds_the_rows_of_a_scene():
     assert built.m == recorded.m
     exact = {"rtol": 0.0, "atol": 1e-12}
     # The two sides of a hinge may be rotated about its axis: rows 3 and 4 of each hinge are compared by their span.
-    rotation, rows = np.eye(built.m), recorded.rows
-    ours, theirs = built.rows.jacobian(built.cones).toarray(), rows.jacobian(recorded.cones).toarray()
+    rotation = np.eye(built.m)
+    rows = recorded.rows
+    ours = built.rows.jacobian(built.cones).toarray()
+    theirs = rows.jacobian(recorded.cones).toarray()
     for i, joint in enumerate(scene.joints):
         if joint.kind == "hinge":
             at = slice(rows.joint_ptr[i] + 3, rows.joint_ptr[i] + 5)

@@ -58,10 +58,8 @@ def test_collide_of_two_boxes_agrees_with_the_slow_twin(numbers):
     q = [y / np.linalg.norm(y) for y in q]
     half = [x[10:13] / 2, x[13:16] / 2]
     place = np.array([x[6], x[7], 1.2 * x[8]])
-    a, b = (
-        (half[0], np.zeros(3), convert_to_rotation_matrix(q[0])),
-        (half[1], place, convert_to_rotation_matrix(q[1])),
-    )
+    a = (half[0], np.zeros(3), convert_to_rotation_matrix(q[0]))
+    b = (half[1], place, convert_to_rotation_matrix(q[1]))
     found = manifold(
         ("box", 2 * half[0], {"quaternion": q[0]}), ("box", 2 * half[1], {"quaternion": q[1], "position": place})
     )
@@ -206,7 +204,8 @@ def test_broad_phase_time_grows_with_the_number_of_bodies():
 def test_jointed_bodies_touch_only_if_enabled():
     for collide, contacts in ((False, 0), (True, 1)):
         scene = lv.Scene(gravity=0.0)
-        a, b = scene.add_sphere(0.5), scene.add_sphere(0.5, position=(0.9, 0, 0))
+        a = scene.add_sphere(0.5)
+        b = scene.add_sphere(0.5, position=(0.9, 0, 0))
         scene.add_joint("ball", a, b, anchor=(0.45, 0, 0), collide=collide)
         assert lv.Simulation(scene).step()[0]["solver"][2] == contacts
 
@@ -222,7 +221,8 @@ def test_warm_start_with_shuffled_or_false_keys_steps_as_without():
     for kind in ("none", "shuffled", "false", "rotated impulses"):
         sim = lv.Simulation(start.scene)
         sim.restore(cold)
-        a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
+        a = sim.state.a
+        n = int(sim.state.head[HEAD["cached"]])
         if kind == "shuffled":
             for i in range(0, n, 4):  # among the points of one pair: the distance guard sees it
                 a["cache_key"][i : i + 4] = rng.permutation(a["cache_key"][i : i + 4])
@@ -241,7 +241,8 @@ def test_warm_start_with_shuffled_or_false_keys_steps_as_without():
 
 def test_warm_start_entry_far_from_the_contact_is_dropped():
     sim = after(60, "stack", n=2, substeps=1)
-    a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
+    a = sim.state.a
+    n = int(sim.state.head[HEAD["cached"]])
     a["cache_local"][:n] += 10.0
     assert sim.step()[0]["solver"][3] == 0
     assert sim.step()[0]["solver"][3] == n
@@ -285,7 +286,8 @@ def test_warm_start_of_a_contact_that_moves_by_five_margins_is_kept(speed, expec
     scene = lv.Scene(substeps=1)
     scene.add_box((2.0, 0.4, 0.2), position=(0.0, 0.0, 0.1), static=True)
     scene.add_box((0.4, 2.0, 0.2), position=(0.0, 0.0, 0.3), angular_velocity=(0.0, 0.0, speed))
-    simulation, at = lv.Simulation(scene), lv.SOLVER_FIELDS.index("cache_matches")
+    simulation = lv.Simulation(scene)
+    at = lv.SOLVER_FIELDS.index("cache_matches")
     matches = [simulation.step()[0]["solver"][at] for _ in range(3)]
     assert matches == [0, expected, expected]
 
@@ -294,7 +296,8 @@ def test_warm_start_of_a_contact_that_moves_by_five_margins_is_kept(speed, expec
 def test_manifold_of_eight_points_keeps_the_deepest(seed):
     """A slab lies turned by 45 degrees and a little tilted on another; a linear program finds the deepest point."""
     rng = np.random.default_rng(seed)
-    turn, tilt = np.pi / 4 + rng.uniform(-0.2, 0.2), 0.002 * rng.normal(size=2)
+    turn = np.pi / 4 + rng.uniform(-0.2, 0.2)
+    tilt = 0.002 * rng.normal(size=2)
     q = np.array([np.cos(turn / 2), *(0.5 * tilt), np.sin(turn / 2)])
     q /= np.linalg.norm(q)
     place = np.array([*rng.uniform(-0.1, 0.1, 2), 0.395])

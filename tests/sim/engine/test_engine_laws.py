@@ -70,7 +70,8 @@ def test_motion_has_the_same_bits_for_every_unit_of_mass(name):
 @pytest.mark.parametrize("shape", ["sphere", "box"])
 def test_scene_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape):
     """The bound on the motion of a substep is half of the body's thickness plus the margin, at any initial distance."""
-    h, margin = 1 / 240, 0.01
+    h = 1 / 240
+    margin = 0.01
     passed = {0.3: 0, 0.98: 0, 1.9: 0}  # Fractions of the bound; above 1 nothing is promised, and some pass.
     for share, size, wall in product(passed, (0.02, 0.2), (0.001, 0.1, None)):
         far = share * (0.5 * size + margin)  # m per substep

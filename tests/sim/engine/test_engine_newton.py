@@ -13,14 +13,23 @@ import lavender as lv
 from lavender_ext.newton.warm_start import FACTORED
 
 SCENES = [
-    ("stack", {"n": 5}), ("stack", {"n": 4, "friction": 0.0}), ("stack", {"n": 4, "patch_radius": 0.1}),
-    ("pyramid", {"base": 5}), ("pyramid", {"base": 5, "friction": 0.15}), ("ramp", {}), ("chain", {"n": 12}),
-    ("bridge", {"n": 5}), ("four_bar", {}), ("newtons_cradle", {"substeps": 1}), ("pile", {"n": 12}),
-]  # fmt: skip
+    ("stack", {"n": 5}),
+    ("stack", {"n": 4, "friction": 0.0}),
+    ("stack", {"n": 4, "patch_radius": 0.1}),
+    ("pyramid", {"base": 5}),
+    ("pyramid", {"base": 5, "friction": 0.15}),
+    ("ramp", {}),
+    ("chain", {"n": 12}),
+    ("bridge", {"n": 5}),
+    ("four_bar", {}),
+    ("newtons_cradle", {"substeps": 1}),
+    ("pile", {"n": 12}),
+]
 
 
 def impulses(sim, observation):
-    first, rows = len(sim.state.a["joint_impulse"]), int(sim.state.head[1])
+    first = len(sim.state.a["joint_impulse"])
+    rows = int(sim.state.head[1])
     return np.concatenate([observation["joint_impulses"], sim.state.a["impulse"][first : first + rows]])
 
 
@@ -72,10 +81,14 @@ def problem_in(scene, step, **parameters):
 @pytest.mark.parametrize(
     ("scene", "step", "parameters"),
     [
-        ("pyramid", 1, {}), ("pyramid", 3, {"friction": 0.2}), ("pyramid", 12, {"friction": 0.2}),
-        ("card_house", 1, ONE), ("card_house", 3, ONE), ("table", 3, {"friction": 1.0, **ONE}),
+        ("pyramid", 1, {}),
+        ("pyramid", 3, {"friction": 0.2}),
+        ("pyramid", 12, {"friction": 0.2}),
+        ("card_house", 1, ONE),
+        ("card_house", 3, ONE),
+        ("table", 3, {"friction": 1.0, **ONE}),
     ],
-)  # fmt: skip
+)
 def test_scene_step_by_newton_of_redundant_contacts_at_rest_is_exact(scene, step, parameters):
     problem = problem_in(scene, step, **parameters)
     assert problem.law == "coulomb"

@@ -59,7 +59,9 @@ def test_scene_restitution_under_gravity_returns_the_speed_before_the_step_in_fi
     scene = lv.Scene(restitution=e, friction=0.0, dt=1.0 / 240.0, substeps=1, restitution_threshold=0.0, slop=0.0)
     scene.add_plane()
     scene.add_sphere(0.5, position=(0, 0, 1.5))
-    sim, before, speeds = lv.Simulation(scene), 0.0, []
+    sim = lv.Simulation(scene)
+    before = 0.0
+    speeds = []
     while len(speeds) < 50:
         after = float(run(sim, 1)["velocities"][1, 2])
         if before < 0.0 < after:
@@ -123,9 +125,11 @@ def slope(angle, turned, shape, **more):
     g, mu = 9.81, 0.5
     down = g * np.sin(angle)
     scene = lv.Scene(
-        gravity=(down * np.cos(turned), down * np.sin(turned), -g * np.cos(angle)), friction=mu,
-        friction_shape=shape, **more,
-    )  # fmt: skip
+        gravity=(down * np.cos(turned), down * np.sin(turned), -g * np.cos(angle)),
+        friction=mu,
+        friction_shape=shape,
+        **more,
+    )
     scene.add_plane()
     scene.add_box((1.0, 1.0, 0.2), position=(0.0, 0.0, 0.1))
     sim = lv.Simulation(scene)
@@ -136,9 +140,12 @@ def slope(angle, turned, shape, **more):
 
 @pytest.mark.parametrize("more", [{}, {"solver": "newton"}])
 def test_a_box_grips_more_on_the_diagonal(more):
-    g, mu, root = 9.81, 0.5, np.sqrt(2.0)
+    g = 9.81
+    mu = 0.5
+    root = np.sqrt(2.0)
     for turned, grip in ((0.0, mu), (np.pi / 4, root * mu)):
-        below, above = np.arctan(grip) - 0.01, np.arctan(grip) + 0.05
+        below = np.arctan(grip) - 0.01
+        above = np.arctan(grip) + 0.05
         assert slope(below, turned, "box", **more) < 1e-3
         speed = g * (np.sin(above) - grip * np.cos(above)) * 1.0
         assert slope(above, turned, "box", **more) == pytest.approx(speed, rel=0.02)

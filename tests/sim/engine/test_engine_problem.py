@@ -26,9 +26,12 @@ def reported(observation, problem):
 
 #: Contacts of one, three, four, five and six rows, which are swept two at a time if they share no body.
 ROWS_OF_CONTACTS = (
-    {"friction": 0.0}, {}, {"patch_radius": 0.1}, {"rolling_radius": 0.05},
+    {"friction": 0.0},
+    {},
+    {"patch_radius": 0.1},
+    {"rolling_radius": 0.05},
     {"patch_radius": 0.1, "rolling_radius": 0.001},
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(
@@ -39,11 +42,14 @@ ROWS_OF_CONTACTS = (
         *(("stack", {"n": 8} | more) for more in ROWS_OF_CONTACTS),
         *(("pyramid", {"base": 6, "friction": 0.05, "friction_shape": "disk"} | more) for more in ROWS_OF_CONTACTS[1:]),
         *(("pile", {"n": 60, "rolling_radius": 0.0, "patch_radius": 0.0, "friction": mu}) for mu in (0.0, 0.5)),
-        ("stack", {"n": 1}), ("table", {}), ("newtons_cradle", {}),
+        ("stack", {"n": 1}),
+        ("table", {}),
+        ("newtons_cradle", {}),
     ],
-)  # fmt: skip
+)
 def test_step_has_the_bits_and_residuals_of_solve(name, more):
-    sim, rows = lv.Simulation(lv.Scene(name, substeps=1, **SCENES.get(name, {}) | more)), 0
+    sim = lv.Simulation(lv.Scene(name, substeps=1, **SCENES.get(name, {}) | more))
+    rows = 0
     order = sim.scene.parameters.order
     asked = {} if order == "alternating" else {"order": order}  # whose contacts stand as they are swept
     for _ in range(30):
@@ -62,7 +68,8 @@ def test_step_has_the_bits_and_residuals_of_solve(name, more):
             judged = lv.residual(problem, impulse)
             error, slack = judged.error[normal], judged.slack[normal]
             # w is a difference of velocities of up to some m/s, so it carries their rounding, some 1e-15 m/s.
-            most, least = np.abs(error).max(initial=0.0), slack.min(initial=0.0)
+            most = np.abs(error).max(initial=0.0)
+            least = slack.min(initial=0.0)
             assert values[f"residual_{when}"] == pytest.approx(most, rel=1e-9, abs=1e-14)
             assert values[f"violation_{when}"] == pytest.approx(-least, rel=1e-9, abs=1e-14)
         rows += problem.m
@@ -110,7 +117,8 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
             sim.load(path)
     # What is cut or lengthened inside a file whose checksum is right.
     end = len(MAGIC) + 8 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 8], "little")
-    header, arrays = json.loads(data[len(MAGIC) + 8 : end]), data[end:-32]
+    header = json.loads(data[len(MAGIC) + 8 : end])
+    arrays = data[end:-32]
     said = header["lengths"]
     for lengths, rest in (
         (said, arrays[:-8]),
@@ -251,10 +259,13 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
 @pytest.mark.parametrize(
     ("parameters", "order"),
     [
-        ({}, "alternating"), *(({"order": order}, order) for order in SCENE_ORDERS), ({"solver": "pgs"}, "given"),
-        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"), ({"solver": "newton"}, None),
+        ({}, "alternating"),
+        *(({"order": order}, order) for order in SCENE_ORDERS),
+        ({"solver": "pgs"}, "given"),
+        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"),
+        ({"solver": "newton"}, None),
     ],
-)  # fmt: skip
+)
 def test_step_reports_the_order_of_its_sweeps(parameters, order):
     sim = lv.Simulation(lv.Scene("stack", n=2, **parameters))
     assert sim.reset()[1]["order"] == sim.step()[-1]["order"] == order

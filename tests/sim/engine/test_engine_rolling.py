@@ -26,7 +26,10 @@ def pile(**more):
 
 @pytest.mark.parametrize("patch", [0.0, 0.1])
 def test_a_ball_rolls_to_rest_where_the_moment_stops_it(patch):
-    sim, radius, speed, reach = ball(patch_radius=patch), 0.5, 2.0, 0.02
+    sim = ball(patch_radius=patch)
+    radius = 0.5
+    speed = 2.0
+    reach = 0.02
     truth = 7 * radius * speed**2 / (10 * reach * G)
     seen = sim.step()[0]
     assert seen["contacts"]["impulses"].shape == (1, 5 + (patch > 0.0))
@@ -61,7 +64,8 @@ def test_ball_without_a_patch_rolls_next_to_balls_with_one():
         scene.add_sphere(0.5, position=(2.0 * i, 0, 0.5), angular_velocity=(0, 4.0, 9.0), patch_radius=patch)
     sim = lv.Simulation(scene)
     for _ in range(5):
-        problem, seen = sim.constraint_problem(), sim.step()[0]
+        problem = sim.constraint_problem()
+        seen = sim.step()[0]
     sizes = np.diff(problem.cones.ptr)
     assert sorted(sizes.tolist()) == [5, 6]
     impulses = seen["contacts"]["impulses"]

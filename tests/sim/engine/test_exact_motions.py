@@ -12,7 +12,8 @@ from lavender.sim.scene.parts import convert_to_rotation_matrix, make_quaternion
 
 G = 9.81
 DT = 1 / 60
-SWEEPS, NEWTON = {}, {"solver": "newton", "substeps": 4}
+SWEEPS = {}
+NEWTON = {"solver": "newton", "substeps": 4}
 SOLVERS = pytest.mark.parametrize("solver", [SWEEPS, NEWTON], ids=["sweeps", "newton"])
 
 
@@ -137,7 +138,8 @@ def test_free_body_flips_with_exact_period_and_keeps_energy_and_momentum(spin):
     inertia = (edges @ edges - edges**2) / 12
     omega0 = np.array([0.05 * spin, spin, 0.0])
     # Jacobi's elliptic functions (Landau, Lifshitz, Mechanics, section 37), with 1 and 3 exchanged if L^2 < 2 E I2.
-    energy, squared = inertia @ omega0**2, ((inertia * omega0) ** 2).sum()
+    energy = inertia @ omega0**2
+    squared = ((inertia * omega0) ** 2).sum()
     i1, i2, i3 = np.sort(inertia)
     if squared < energy * i2:
         i1, i3 = i3, i1
@@ -216,8 +218,11 @@ def compute_min_arch_thickness(stones, lean):
 
         H >= (D tan a - t)/2,        H (D cos a - t sin a) <= D (D sin a + t cos a)/2
     """
-    s, c, d = math.sin(lean), math.cos(lean), np.arange(1.0, stones + 1)
-    low, high = 0.0, float(stones)
+    s = math.sin(lean)
+    c = math.cos(lean)
+    d = np.arange(1.0, stones + 1)
+    low = 0.0
+    high = float(stones)
     for _ in range(60):
         t = 0.5 * (low + high)
         arm = d * c - t * s
@@ -238,7 +243,8 @@ def make_arch(thickness, stones=4, slope=0.5, **parameters):
     foot = stones * s + 0.5 * thick * c
     for side in (-1.0, 1.0):
         for i in range(stones):
-            x, z = side * (foot - (i + 0.5) * s), foot * s / c + (i + 0.5) * c
+            x = side * (foot - (i + 0.5) * s)
+            z = foot * s / c + (i + 0.5) * c
             turned = make_quaternion((0.0, 1.0, 0.0), -side * lean)
             scene.add_box((thick, 1.0, 1.0), position=(x, 0.0, z), quaternion=turned)
     return scene
@@ -247,13 +253,16 @@ def make_arch(thickness, stones=4, slope=0.5, **parameters):
 @pytest.mark.parametrize(
     ("scene", "stands"),
     [
-        (lambda: make_overhang(0.98, 10, **NEWTON), True), (lambda: make_overhang(1.02, 10, **NEWTON), False),
-        (lambda: make_overhang(0.98, 5), True), (lambda: make_arch(1.05), True), (lambda: make_arch(0.95), False),
+        (lambda: make_overhang(0.98, 10, **NEWTON), True),
+        (lambda: make_overhang(1.02, 10, **NEWTON), False),
+        (lambda: make_overhang(0.98, 5), True),
+        (lambda: make_arch(1.05), True),
+        (lambda: make_arch(0.95), False),
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=1e4, gravity=G, dt=DT, friction=0.5, **NEWTON), True),
         (lambda: lv.Scene("heavy_on_light", n=3, ratio=100.0, gravity=G, dt=DT, friction=0.5), True),
     ],
     ids=["overhang 10", "too far 10", "overhang 5, sweeps", "arch", "too thin", "heavy newton", "heavy sweeps"],
-)  # fmt: skip
+)
 def test_scene_structure_stands_exactly_if_statics_allows(scene, stands):
     _, x, _, _ = record(scene(), 8.0)
     drop = (x[0] - x[-1])[:, 2].max()

@@ -11,7 +11,8 @@ def test_film_of_a_moving_ball_shows_its_projected_path(tmp_path):
     """The ball's diameter of 1 m gives the scale in pixels; its centre moves by (4, -1, 2) m."""
     scene = lv.Scene()
     scene.add_sphere(0.5)
-    film, path = Film(lv.Simulation(scene)), np.array([4.0, -1.0, 2.0])
+    film = Film(lv.Simulation(scene))
+    path = np.array([4.0, -1.0, 2.0])
     for time in (0.02, 0.04, 0.06, 0.08):  # The first and the third are before the next frame.
         film.add(time, path[None] * (time / 0.08), np.array([[1.0, 0.0, 0.0, 0.0]]))
     film.add(0.12, np.full((1, 3), np.nan), np.array([[1.0, 0.0, 0.0, 0.0]]))

@@ -26,12 +26,20 @@ def test_scene_of_one_box_gives_the_documented_observation():
 @pytest.mark.parametrize(
     ("name", "more", "bodies", "contacts", "rows"),
     [
-        ("stack", {"friction": 0.0}, 7, 24, 24), ("stack", {}, 7, 24, 72), ("stack", {"patch_radius": 0.1}, 7, 24, 96),
-        ("pyramid", {"base": 10}, 56, 400, 1200), ("table", {}, 11, 72, 216), ("heavy_on_light", {}, 3, 8, 24),
-        ("ramp", {}, 2, 4, 12), ("spinner", {}, 2, 1, 4), ("chain", {"n": 7}, 7, 0, 21),
-        ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25), ("four_bar", {}, 3, 0, 20), ("four_bar", {"motor": 1.0}, 3, 0, 21),
+        ("stack", {"friction": 0.0}, 7, 24, 24),
+        ("stack", {}, 7, 24, 72),
+        ("stack", {"patch_radius": 0.1}, 7, 24, 96),
+        ("pyramid", {"base": 10}, 56, 400, 1200),
+        ("table", {}, 11, 72, 216),
+        ("heavy_on_light", {}, 3, 8, 24),
+        ("ramp", {}, 2, 4, 12),
+        ("spinner", {}, 2, 1, 4),
+        ("chain", {"n": 7}, 7, 0, 21),
+        ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25),
+        ("four_bar", {}, 3, 0, 20),
+        ("four_bar", {"motor": 1.0}, 3, 0, 21),
     ],
-)  # fmt: skip
+)
 def test_scene_observation_has_the_sizes_of_its_docstrings(name, more, bodies, contacts, rows):
     scene = lv.Scene(name, **more)
     problem = lv.Simulation(scene).constraint_problem()
@@ -45,7 +53,9 @@ def test_scene_without_friction_or_spin_allocates_no_rows():
         scene.add_sphere(position=(0, 0, 0.5))
         return lv.Simulation(scene).state
 
-    smooth, rough, spin = size(friction=0.0), size(), size(patch_radius=0.1)
+    smooth = size(friction=0.0)
+    rough = size()
+    spin = size(patch_radius=0.1)
     rows = SIZE["rows_per_contact"]
     assert [s.size[rows] for s in (smooth, rough, spin)] == [1, 3, 4]
     assert smooth.nbytes < rough.nbytes < spin.nbytes
@@ -80,8 +90,10 @@ def test_scene_contacts_have_only_the_rows_of_their_friction():
 
 #: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
 REFUSED = [
-    (lambda s: s.add_box(mass=0.0), "mass"), (lambda s: s.add_box((1, 0, 1)), "positive"),
-    (lambda s: s.add_sphere(0.0), "radius"), (lambda s: s.add_plane((0, 0, 0)), "direction"),
+    (lambda s: s.add_box(mass=0.0), "mass"),
+    (lambda s: s.add_box((1, 0, 1)), "positive"),
+    (lambda s: s.add_sphere(0.0), "radius"),
+    (lambda s: s.add_plane((0, 0, 0)), "direction"),
     (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
     (lambda s: s.add_body(quaternion=(0, 0, 0, 0)), "quaternion"),
     (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
@@ -96,7 +108,8 @@ REFUSED = [
     (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
     (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
     (lambda s: s.add_body(static=True, velocity=(1, 0, 0)), "static"),
-    (lambda s: s.add_body(friction=-0.1), "friction"), (lambda s: s.add_body(restitution=1.1), "restitution"),
+    (lambda s: s.add_body(friction=-0.1), "friction"),
+    (lambda s: s.add_body(restitution=1.1), "restitution"),
     (lambda s: s.add_joint("ball", 0, 7, anchor=(0, 0, 0)), "body of ball 0 .* is 7"),
     (lambda s: s.add_joint("ball", 0, -2, anchor=(0, 0, 0)), "body of .* is -2"),
     (lambda s: s.add_joint("ball", 0, 0, anchor=(0, 0, 0)), "two bodies"),
@@ -111,22 +124,38 @@ REFUSED = [
     (lambda s: s.add_joint("distance", 0, -1, anchor_a=(0, 0, 0), anchor_b=(0, 0, 0)), "length 0"),
     (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
     (lambda s: s.add_joint("slider", 0, -1), "joint 'slider'"),
-    *((lambda s, more=more: lv.Scene("stack", **more), words) for more, words in (
-        ({"dt": 0.0}, "dt"), ({"substeps": 0}, "substeps"), ({"friction": -1.0}, "friction"),
-        ({"restitution": 2.0}, "restitution"), ({"rolling_radius": -0.1}, "rolling_radius"),
-        ({"max_substep": 0.0}, "max_substep"), ({"max_substep": 1e-60}, "substeps"), ({"dt": 1e60}, "substeps"),
-        ({"friction_shape": "square"}, "friction_shape"),
-        ({"solver": "pgz"}, "did you mean 'pgs'"), ({"order": "bottomup"}, "bottom_up"),
-        ({"on_failure": "ignore"}, "on_failure"), ({"solver_options": {"omega": 1}}, "solver_options"),
-        ({"solver": "pgs", "order": "reverse"}, "solver_options"), ({"solver_options": 3, "solver": "pgs"}, "mapping"),
-        ({"gravity": -9.81}, r"downward acceleration.* give 9.81"), ({"frction": 1.0}, "did you mean 'friction'"),
-        ({"n": 0}, "n is 0"))),
-    (lambda s: lv.Scene(["stack"]), r"unknown scene \['stack'\]"), (lambda s: lv.Scene("stac"), "did you mean 'stack'"),
-    (lambda s: lv.Scene("chain", tipmass=1.0), "tip_mass"), (lambda s: lv.Scene("pile", kind="sphere"), "spheres"),
-    (lambda s: lv.Scene(n=3), "unknown"), (lambda s: lv.Simulation(lv.Scene()), "no bodies"),
+    *(
+        (lambda s, more=more: lv.Scene("stack", **more), words)
+        for more, words in (
+            ({"dt": 0.0}, "dt"),
+            ({"substeps": 0}, "substeps"),
+            ({"friction": -1.0}, "friction"),
+            ({"restitution": 2.0}, "restitution"),
+            ({"rolling_radius": -0.1}, "rolling_radius"),
+            ({"max_substep": 0.0}, "max_substep"),
+            ({"max_substep": 1e-60}, "substeps"),
+            ({"dt": 1e60}, "substeps"),
+            ({"friction_shape": "square"}, "friction_shape"),
+            ({"solver": "pgz"}, "did you mean 'pgs'"),
+            ({"order": "bottomup"}, "bottom_up"),
+            ({"on_failure": "ignore"}, "on_failure"),
+            ({"solver_options": {"omega": 1}}, "solver_options"),
+            ({"solver": "pgs", "order": "reverse"}, "solver_options"),
+            ({"solver_options": 3, "solver": "pgs"}, "mapping"),
+            ({"gravity": -9.81}, r"downward acceleration.* give 9.81"),
+            ({"frction": 1.0}, "did you mean 'friction'"),
+            ({"n": 0}, "n is 0"),
+        )
+    ),
+    (lambda s: lv.Scene(["stack"]), r"unknown scene \['stack'\]"),
+    (lambda s: lv.Scene("stac"), "did you mean 'stack'"),
+    (lambda s: lv.Scene("chain", tipmass=1.0), "tip_mass"),
+    (lambda s: lv.Scene("pile", kind="sphere"), "spheres"),
+    (lambda s: lv.Scene(n=3), "unknown"),
+    (lambda s: lv.Simulation(lv.Scene()), "no bodies"),
     (lambda s: lv.Simulation(3), r"lavender.Scene is needed"),
     (lambda s: lv.Simulation("stack").step([1, 2]), "has no actions"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("call", "words"), REFUSED)

@@ -15,7 +15,10 @@ MAX_DISPLACEMENT = 0.05  # m: a box that is further from its start at any time d
 def drift(name, seconds=SECONDS, *, dt=1 / 60, **parameters):
     """Largest distance [m] of a body from where it was after two seconds, looked at ten times a second."""
     sim = lv.Simulation(lv.Scene(name, dt=dt, **parameters))
-    every, start, most, first = round(0.1 / dt), None, 0.0, sim.state.a["x"].copy()
+    every = round(0.1 / dt)
+    start = None
+    most = 0.0
+    first = sim.state.a["x"].copy()
     for step in range(every, round(seconds / dt) + 1, every):
         left = every * sim.scene.parameters.substeps
         while left:
@@ -65,10 +68,8 @@ def test_scene_stack_in_whole_steps_and_given_order_drifts():
 
 @pytest.mark.parametrize(
     ("dt", "substeps"),
-    [
-        (1 / 60, 4), (1 / 120, 2), (1 / 240, 1), (1 / 50, 5), (1 / 100, 3), (1 / 1000, 1), (1 / 30, 8), (0.1, 24),
-    ],
-)  # fmt: skip
+    [(1 / 60, 4), (1 / 120, 2), (1 / 240, 1), (1 / 50, 5), (1 / 100, 3), (1 / 1000, 1), (1 / 30, 8), (0.1, 24)],
+)
 def test_scene_substeps_are_no_longer_than_the_maximum(dt, substeps):
     assert lv.Scene("stack", dt=dt).parameters.substeps == substeps
     assert lv.Scene("stack", dt=dt, max_substep=dt / 3).parameters.substeps == 3
@@ -106,7 +107,8 @@ def test_scene_with_alternating_order_reverses_contacts_in_each_substep():
 def test_bearing_contact_within_the_slop_is_in_place():
     """Target of the normal row, equations (1) and (2) of the engine's contacts, read from the problem."""
     sim = lv.Simulation(lv.Scene("stack", n=1, substeps=1, dt=0.01, gravity=10.0))
-    p, beta = sim.scene.parameters, sim.state.setting[SETTING["beta"]]
+    p = sim.scene.parameters
+    beta = sim.state.setting[SETTING["beta"]]
     for _ in range(5):
         sim.step()
 

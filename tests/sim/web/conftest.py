@@ -61,7 +61,9 @@ class Visit:
     """A page with what it complained of and what it asked for."""
 
     def __init__(self, page, address):
-        self.page, self.context, self.address = page, page.context, address
+        self.page = page
+        self.context = page.context
+        self.address = address
         self.complaints, self.requests = [], []
         self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text))
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))

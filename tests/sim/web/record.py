@@ -25,34 +25,45 @@ BODY_ARRAYS = ("x", "q", "v")
 
 #: Gallery scene, parameters, and what is changed before which step.
 SCENES = [
-    ("stack", {}, {100: {"warm_start": 0}, 200: {"warm_start": 1}}), ("stack", {"substeps": 1}, {}),
+    ("stack", {}, {100: {"warm_start": 0}, 200: {"warm_start": 1}}),
+    ("stack", {"substeps": 1}, {}),
     ("stack", {"n": 4}, {40: {"velocity": [4, BLOW]}, 149: {"velocity": [2, BLOW[::-1]]}}),
-    ("pyramid", {"base": 8}, {150: {"iterations": 4}}), ("chain", {"tip_mass": 5.0}, {}), ("spinner", {}, {}),
+    ("pyramid", {"base": 8}, {150: {"iterations": 4}}),
+    ("chain", {"tip_mass": 5.0}, {}),
+    ("spinner", {}, {}),
     ("pile", {"n": 60, "kind": "mixed", "substeps": 2}, {}),
     ("stack", {"n": 5, "order": "random", "seed": 3, "solver_iterations": 64}, {}),
     ("pyramid", {"base": 4, "order": "symmetric"}, {}),
     ("pyramid", {"base": 4, "order": "top_down", "solver_iterations": 4}, {}),
-    ("card_house", {"order": "bottom_up"}, {}), ("bridge", {"order": "colored"}, {}),
-    ("four_bar", {"order": "reverse", "motor": 2.0}, {}), ("newtons_cradle", {}, {}),
-    ("pyramid", {"base": 4, "restitution": 0.3}, {}), ("pile", {"n": 30, "kind": "mixed", "friction_shape": "box"}, {}),
-]  # fmt: skip
+    ("card_house", {"order": "bottom_up"}, {}),
+    ("bridge", {"order": "colored"}, {}),
+    ("four_bar", {"order": "reverse", "motor": 2.0}, {}),
+    ("newtons_cradle", {}, {}),
+    ("pyramid", {"base": 4, "restitution": 0.3}, {}),
+    ("pile", {"n": 30, "kind": "mixed", "friction_shape": "box"}, {}),
+]
 
 
 #: The same for Newton's method on both sides of the border: joints and contacts alone and together, spin, cold starts.
 NEWTON_STEPS = 80
 NEWTON_SCENES = [
-    ("stack", {}, {20: {"warm_start": 0}, 60: {"warm_start": 1}}), ("pyramid", {"base": 5, "friction": 0.15}, {}),
-    ("pile", {"n": 12, "kind": "mixed"}, {}), ("pyramid", {"base": 4, "friction_shape": "box"}, {}),
-    ("bridge", {"n": 5}, {}), ("chain", {}, {60: {"warm_start": 0}}), ("four_bar", {}, {}),
+    ("stack", {}, {20: {"warm_start": 0}, 60: {"warm_start": 1}}),
+    ("pyramid", {"base": 5, "friction": 0.15}, {}),
+    ("pile", {"n": 12, "kind": "mixed"}, {}),
+    ("pyramid", {"base": 4, "friction_shape": "box"}, {}),
+    ("bridge", {"n": 5}, {}),
+    ("chain", {}, {60: {"warm_start": 0}}),
+    ("four_bar", {}, {}),
     ("spinner", {}, {60: {"warm_start": 0}}),
-]  # fmt: skip
+]
 
 
 class Writer:
     """Arrays one after the other, and where each one is."""
 
     def __init__(self):
-        self.parts, self.at = [], 0
+        self.parts = []
+        self.at = 0
 
     def put(self, values, dtype):
         data = np.ascontiguousarray(values).astype(dtype).tobytes()
@@ -85,11 +96,16 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
         hashes.append(hashlib.sha256(shot.real.tobytes() + shot.index.tobytes() + shot.keys.tobytes()).digest())
     given = ", ".join(f"{key}={value}" for key, value in parameters.items())
     return {
-        "name": f"{name}({given})", "substeps": scene.parameters.substeps, "steps": steps,
-        "changes": {str(step): change for step, change in changes.items()}, **describe_snapshot(start),
-        "states": writer.put(states, "<f8"), "values": writer.put(values, "<f8"),
-        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"), "last": writer.put(shot.real, "<f8"),
-    }  # fmt: skip
+        "name": f"{name}({given})",
+        "substeps": scene.parameters.substeps,
+        "steps": steps,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe_snapshot(start),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
+        "last": writer.put(shot.real, "<f8"),
+    }
 
 
 def record_newton(writer, name, parameters, changes):
@@ -106,13 +122,21 @@ def record_newton(writer, name, parameters, changes):
         hashes.append(hashlib.sha256(run.everything()).digest())
     given = ", ".join(f"{key}={value}" for key, value in parameters.items())
     return {
-        "name": f"{name}({given}), newton", "dt": run.simulation.scene.parameters.dt, "substeps": run.substeps,
-        "newton_substeps": run.substeps, "steps": NEWTON_STEPS,
-        "changes": {str(step): change for step, change in changes.items()}, **describe_snapshot(start),
-        "met": sum(how > 0 for how in run.ended), "solved": len(run.ended), "states": writer.put(states, "<f8"),
-        "values": writer.put(values, "<f8"), "said": writer.put(said, "<f8"), "trace": writer.put(run.trace, "<f8"),
+        "name": f"{name}({given}), newton",
+        "dt": run.simulation.scene.parameters.dt,
+        "substeps": run.substeps,
+        "newton_substeps": run.substeps,
+        "steps": NEWTON_STEPS,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe_snapshot(start),
+        "met": sum(how > 0 for how in run.ended),
+        "solved": len(run.ended),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "said": writer.put(said, "<f8"),
+        "trace": writer.put(run.trace, "<f8"),
         "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
-    }  # fmt: skip
+    }
 
 
 def record(folder, steps=STEPS):

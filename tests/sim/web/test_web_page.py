@@ -201,10 +201,16 @@ def disturbed(v):
 
 
 TOURS = {
-    "#pyramid": settings, "#stack": restore, "#stack&gallery": gallery, "#chain": joints, "": opening, "#": presets,
+    "#pyramid": settings,
+    "#stack": restore,
+    "#stack&gallery": gallery,
+    "#chain": joints,
+    "": opening,
+    "#": presets,
     "#scene=pyramid&a=8,cold,top_down&b=40,warm,random&speed=0.25&play=0": address,
-    "#scene=bridge&a=16,warm,given&b=16,warm,given&play=0": fetched, "#experiment=4": disturbed,
-}  # fmt: skip
+    "#scene=bridge&a=16,warm,given&b=16,warm,given&play=0": fetched,
+    "#experiment=4": disturbed,
+}
 
 
 def compare_told(name, told):
@@ -219,7 +225,8 @@ def compare_told(name, told):
 
 @pytest.mark.parametrize("start", TOURS)
 def test_web_tour_shows_native_numbers(visit, start):
-    tour, told = TOURS[start], []
+    tour = TOURS[start]
+    told = []
     v = visit("#stack" if start == "#stack&gallery" else "#stack" if start == "#" else start)
     for expected in tour(v):
         if expected is not None:
