@@ -18,14 +18,15 @@ kernels:  ## build the changed modules of lavender_ext/
 test: kernels  ## run all tests
 	$(PYTHON) -m pytest -q -n auto --dist worksteal
 
-gates:  ## format, run linters, layers, language, the table of calls, contracts of changed solvers, sizes (under a minute)
+gates:  ## format, run linters, spelling, layers, the table of calls, contracts of changed solvers (under a minute)
 	.ci/gates
 
 quick: kernels  ## run all tests except slow ones, stop at the first failure
 	$(PYTHON) -m pytest -q -x -m "not slow"
 
-lint:  ## run ruff, import-linter and cython-lint
+lint:  ## run ruff, codespell, import-linter and cython-lint
 	$(BIN)ruff check .
+	$(BIN)codespell
 	$(BIN)lint-imports
 	PATH="$(abspath $(BIN)):$$PATH" cython-lint $$(git ls-files 'lavender_ext/*.pyx' 'lavender_ext/*.pxd')
 
