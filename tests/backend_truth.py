@@ -8,7 +8,9 @@ import lavender as lv
 
 TOL = 1e-6
 KINDS = "definite", "singular", "repeated", "placeholder"
-MAX_RATIO = 10.0  # An answer may be this many times as far from the KKT conditions as the backend's own.
+MAX_RATIO = (
+    10.0  # An answer may be this many times as far from the KKT conditions as the backend's own.
+)
 # Settings of a backend called alone: the ones that its adapter passes, at the same tolerance.
 INTERIOR = {"feastol": TOL, "abstol": TOL, "reltol": TOL}
 PROXIMAL = {"eps_abs": TOL, "eps_rel": 0.0}
@@ -99,7 +101,12 @@ def compute_kkt_error(program, x, y=None, z=None, z_box=None):
     parts = ([] if v is None else np.ravel(v) for v in (x, y, z, z_box))
     x, y, z, box = (np.array(part, np.longdouble) for part in parts)
     box = box if len(box) else np.zeros(n)
-    if len(x) != n or len(y) < len(A) or len(z) < len(G) or not all(np.isfinite(v).all() for v in (x, y, z, box)):
+    if (
+        len(x) != n
+        or len(y) < len(A)
+        or len(z) < len(G)
+        or not all(np.isfinite(v).all() for v in (x, y, z, box))
+    ):
         return np.inf
     y, z = y[: len(A)], z[: len(G)]  # Some backends return a zero without rows.
 
@@ -115,8 +122,16 @@ def compute_kkt_error(program, x, y=None, z=None, z_box=None):
     gap = np.concatenate([gx - h, low - x, x - high])
     w = np.concatenate([z, np.maximum(-box, 0.0), np.maximum(box, 0.0)])
     is_finite = np.isfinite(gap)
-    product = np.where(is_finite, np.abs(np.where(is_finite, gap, 0.0) * w) / size, np.abs(w)) / force
-    errors = np.abs(sum(terms)) / force, np.abs(ax - b) / size, np.maximum(gap, 0.0) / size, -w / force, product
+    product = (
+        np.where(is_finite, np.abs(np.where(is_finite, gap, 0.0) * w) / size, np.abs(w)) / force
+    )
+    errors = (
+        np.abs(sum(terms)) / force,
+        np.abs(ax - b) / size,
+        np.maximum(gap, 0.0) / size,
+        -w / force,
+        product,
+    )
     return float(max(np.max(part, initial=0.0) for part in errors))
 
 

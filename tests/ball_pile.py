@@ -29,10 +29,16 @@ class Pile:
         spread = rng.choice([0.0, 0.0, 0.1, 0.3])
         heavy = rng.choice([1.0, 1.0, 10.0])
         self.radius = 0.5 * (1.0 + spread * rng.uniform(-1.0, 1.0, n))  # m
-        self.side = np.ceil((n / rng.choice([1.0, 2.0])) ** (1 / 3)) + rng.choice([0.2, 0.6, 1.0])  # m
+        self.side = np.ceil((n / rng.choice([1.0, 2.0])) ** (1 / 3)) + rng.choice(
+            [0.2, 0.6, 1.0]
+        )  # m
         k = int(self.side)
         i = np.arange(n)
-        grid = [(i % k + 0.6) * self.side / k, i // k**2 * 1.1 + 0.55, (i // k % k + 0.6) * self.side / k]
+        grid = [
+            (i % k + 0.6) * self.side / k,
+            i // k**2 * 1.1 + 0.55,
+            (i // k % k + 0.6) * self.side / k,
+        ]
         self.place = np.transpose(grid) + rng.uniform(-0.05, 0.05, (n, 3))
         self.mass = np.where(rng.random(n) < 0.1, heavy, 1.0) * (self.radius / 0.5) ** 3  # kg
         self.velocity = np.zeros((n, 6))
@@ -42,7 +48,9 @@ class Pile:
         out = []
         for axis, sign in WALLS:
             gap = sign * self.place[:, axis] + (self.side if sign < 0 else 0.0) - self.radius
-            out += [(-1, i, sign * np.eye(3)[axis], gap[i]) for i in np.flatnonzero(gap < CONTACT_GAP)]
+            out += [
+                (-1, i, sign * np.eye(3)[axis], gap[i]) for i in np.flatnonzero(gap < CONTACT_GAP)
+            ]
         apart = self.place[None] - self.place[:, None]
         length = np.sqrt((apart**2).sum(axis=-1))
         gap = length - self.radius - self.radius[:, None]

@@ -37,7 +37,11 @@ def long_way(problem, solver, **options):
 def facts(solution):
     """Everything a solution says but its times, arrays by their bits, numbers and turns by their words: NaN is NaN."""
     r = solution.residual
-    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
+    told = {
+        f.name: getattr(solution, f.name)
+        for f in fields(solution)
+        if f.name not in (*TIMES, "residual")
+    }
     told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
     told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
     words = {k: repr(v) if isinstance(v, float | tuple) else v for k, v in told.items()}
@@ -48,7 +52,9 @@ def check(problem, solver, **options):
     short = lv.solve(problem, solver, **options)
     expected = facts(long_way(problem, solver, **options))
     assert facts(short) == expected
-    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
+    assert (
+        facts(lv.solve(problem, solver, **options)) == expected
+    )  # what is kept was left as it was found
     return short
 
 
@@ -75,7 +81,9 @@ def over_velocities(m, nv, seed=0, cones=None, **more):
     half = rng.normal(size=(nv, nv))
     cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2) if cones is None else cones
     mass = half @ half.T / nv + np.eye(nv)
-    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones, **more)
+    return lv.Problem.from_jacobian(
+        rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones, **more
+    )
 
 
 def prepare_sweeps(problem, name="sequential_impulses", packs=True, **options):
@@ -86,10 +94,16 @@ def prepare_sweeps(problem, name="sequential_impulses", packs=True, **options):
     return prepared
 
 
-def sweep_in_parts(problem, counts, name="sequential_impulses", *, start=None, packs=True, **options):
+def sweep_in_parts(
+    problem, counts, name="sequential_impulses", *, start=None, packs=True, **options
+):
     """Impulse and velocities of bodies after runs of those many sweeps each, and (packed records, stages)."""
     prepared = prepare_sweeps(problem, name, packs, **options)
-    lam = 0.05 * np.abs(np.random.default_rng(problem.m).normal(size=problem.m)) if start is None else start.copy()
+    lam = (
+        0.05 * np.abs(np.random.default_rng(problem.m).normal(size=problem.m))
+        if start is None
+        else start.copy()
+    )
     for n in counts:
         prepared.solver.run(prepared.state, lam, n, 0.0)
     sweeps = prepared.state.sweeps
@@ -111,7 +125,9 @@ def robot(seed, m=12, n=10, soft=True, number=np.float64):
     mass = tree_mass(rng, random_tree_parents(rng, n))
     jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
     jac[:, 0] += 0.3
-    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
+    compliance = rng.uniform(0.02, 0.2, m) * np.einsum(
+        "ij,ij->i", jac, np.linalg.solve(mass, jac.T).T
+    )
     upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
     return lv.Problem.from_jacobian(
         jac.astype(number),
@@ -129,7 +145,9 @@ MORE, REACHED, CERTIFICATE = 0, 1, 4
 
 def driven(problem, tol=1e-9, budget=1500, work=10**6):
     """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
-    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    lv.residual(
+        problem, problem.start()
+    )  # d, nu and J M^-1 J^T of a problem are known once it is judged
     driver = Driver(problem.metric)
     impulse = problem.start().copy()
     if not driver.fits:
@@ -167,7 +185,11 @@ def block_diagonal(system, values):
 def system_in(problem, form):
     """The started system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     get_zero_impulse_reference(problem)
-    system = MatrixSystem(problem, may_be_dense=False) if form == "sparse" else make_system(problem, form)
+    system = (
+        MatrixSystem(problem, may_be_dense=False)
+        if form == "sparse"
+        else make_system(problem, form)
+    )
     assert form != "sparse" or not system.dense
     system.solve.start(problem.start(), 0.0, 1)
     return system

@@ -5,7 +5,9 @@ import signal
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")  # before NumPy starts its threads: small matrices only lose by them
+    os.environ.setdefault(
+        variable, "1"
+    )  # before NumPy starts its threads: small matrices only lose by them
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Workers of xdist and other processes would compile all that they import each time: 1.8 of 3.0 s of a command.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -25,8 +27,12 @@ for variable in ("COLUMNS", "LINES"):
 
 # A shared machine may take any time for an example, and a generator may reject any share of them. The examples of a
 # change are the same in every run; `--nightly` draws new ones, and .ci/fuzz (profile "search") draws many.
-free = hypothesis.settings(deadline=None, suppress_health_check=list(hypothesis.HealthCheck), print_blob=True)
-hypothesis.settings.register_profile("change", free, derandomize=True, max_examples=10, stateful_step_count=25)
+free = hypothesis.settings(
+    deadline=None, suppress_health_check=list(hypothesis.HealthCheck), print_blob=True
+)
+hypothesis.settings.register_profile(
+    "change", free, derandomize=True, max_examples=10, stateful_step_count=25
+)
 hypothesis.settings.register_profile("nightly", free, max_examples=200)
 hypothesis.settings.register_profile("search", free, max_examples=1000)
 
@@ -34,7 +40,11 @@ PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
 def pytest_addoption(parser):
-    parser.addoption("--nightly", action="store_true", help="also run the tests marked `nightly`, and 200 new examples")
+    parser.addoption(
+        "--nightly",
+        action="store_true",
+        help="also run the tests marked `nightly`, and 200 new examples",
+    )
 
 
 def pytest_configure(config):
@@ -45,7 +55,9 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     """Deselect the tests marked `nightly` without --nightly. The longest test begins first."""
     if not config.getoption("nightly"):
-        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("nightly")])
+        config.hook.pytest_deselected(
+            items=[item for item in items if item.get_closest_marker("nightly")]
+        )
         items[:] = [item for item in items if not item.get_closest_marker("nightly")]
     items.sort(key=lambda item: "parity" not in item.path.parts)
 
@@ -113,7 +125,11 @@ def plug_in(register):
                 return run(state, impulse)
 
         laws = {"linear", "lcp", "coulomb", "cone"}
-        register(SolverSpec(name, PlugIn, **{"laws": laws, "summary": "of a test", "resumable": False, **more}))
+        register(
+            SolverSpec(
+                name, PlugIn, **{"laws": laws, "summary": "of a test", "resumable": False, **more}
+            )
+        )
         return name
 
     return add

@@ -8,7 +8,9 @@ import numpy as np
 def random_bounds(rng, m):
     """Draw lower and upper bounds (m,) of rows: only lower, both, only upper, none, or equal bounds."""
     kind = rng.integers(0, 5, m)
-    return np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5]), np.choose(kind, [np.inf, 1.0, 0.5, np.inf, 0.5])
+    return np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5]), np.choose(
+        kind, [np.inf, 1.0, 0.5, np.inf, 0.5]
+    )
 
 
 def enumerate_lcp(a, b, lower, upper, tol=1e-9):

@@ -22,7 +22,22 @@ import lavender as lv
 
 # The largest number that a problem may have.
 LARGEST = 1e60
-SPECIAL = (0.0, 5e-324, 1e-300, 1e-61, 1e-60, 1e-59, 1e-30, 1e-20, 1.0, 1.0 + 2.0**-52, 1e20, 1e30, 1e59, LARGEST)
+SPECIAL = (
+    0.0,
+    5e-324,
+    1e-300,
+    1e-61,
+    1e-60,
+    1e-59,
+    1e-30,
+    1e-20,
+    1.0,
+    1.0 + 2.0**-52,
+    1e20,
+    1e30,
+    1e59,
+    LARGEST,
+)
 SHAPES = {
     "inv_inertia": (-1, 3, 3),
     "v_free": (-1, 6),
@@ -48,7 +63,12 @@ def plain_data(problem):
 
 def build_problem(data):
     """Build the problem of plain data; InputError if it is not valid."""
-    cones = lv.Cones(**{key: np.array(x, np.int32 if key in INDICES else float) for key, x in data["cones"].items()})
+    cones = lv.Cones(
+        **{
+            key: np.array(x, np.int32 if key in INDICES else float)
+            for key, x in data["cones"].items()
+        }
+    )
     more = {"friction": data["friction"], "guess": data.get("guess")}
     if data["operator"] == "general":
         n = len(data["v_free"])
@@ -67,7 +87,9 @@ def build_problem(data):
             key: np.array(x, np.int32 if key in INDICES else float).reshape(SHAPES.get(key, -1))
             for key, x in data["rows"].items()
         }
-        return lv.Problem(b, cones, rows=lv.Rows(**arrays), compliance=data.get("compliance"), **more)
+        return lv.Problem(
+            b, cones, rows=lv.Rows(**arrays), compliance=data.get("compliance"), **more
+        )
     a = np.array(data["A"], float).reshape(len(b), len(b))
     return lv.Problem(b, cones, sp.csr_array(a) if data["operator"] == "csr" else a, **more)
 
@@ -158,14 +180,22 @@ def change(data, name, how, seed):
         return
     x = np.array(home[name], float)
     if name in ("A", "M") and how != "special numbers":
-        scale = 10.0 ** rng.integers(-12, 12, len(x)) if how.startswith("scaled") else rng.integers(0, 2, len(x))
+        scale = (
+            10.0 ** rng.integers(-12, 12, len(x))
+            if how.startswith("scaled")
+            else rng.integers(0, 2, len(x))
+        )
         x = scale[:, None] * x * scale
     else:
         with np.errstate(all="ignore"):
             x = replaced(x, how, rng)
         if name == "inv_inertia":
             x = 0.5 * x + 0.5 * x.transpose(0, 2, 1)
-    sign = np.abs if name in ("inv_mass", "mu", "patch_radius", "rolling", "compliance") else np.asarray
+    sign = (
+        np.abs
+        if name in ("inv_mass", "mu", "patch_radius", "rolling", "compliance")
+        else np.asarray
+    )
     home[name] = np.clip(sign(x), -LARGEST, LARGEST).tolist()
 
 
@@ -195,7 +225,11 @@ CHANGES = ("scaled entries", "scaled", "a zero row", "a copied row", "special nu
 def problem_data(draw):
     """A problem of any law and form; in most, numbers of up to three arrays are extreme."""
     data = plain_data(MAKERS[draw(st.sampled_from(sorted(MAKERS)))](draw(seeds)))
-    present = [name for name in ARRAYS if any(name in d for d in (data, data["cones"], data.get("rows", {})))]
+    present = [
+        name
+        for name in ARRAYS
+        if any(name in d for d in (data, data["cones"], data.get("rows", {})))
+    ]
     changes = st.tuples(st.sampled_from(present), st.sampled_from(CHANGES), seeds)
     for name, how, seed in draw(st.lists(changes, max_size=3)):
         change(data, name, how, seed)

@@ -61,7 +61,10 @@ def drawn(seed, kind, law="coulomb", operator="dense", count=3):
     b[cones.normal_rows] += rng.choice([-0.5, 1.5], len(cones.normal_rows), p=[0.25, 0.75])
     if operator == "generalized":
         nv = m + 2
-        jac, root = rng.standard_normal((m, nv)) / np.sqrt(nv), rng.standard_normal((nv, nv)) / np.sqrt(nv)
+        jac, root = (
+            rng.standard_normal((m, nv)) / np.sqrt(nv),
+            rng.standard_normal((nv, nv)) / np.sqrt(nv),
+        )
         mass = root @ root.T + np.eye(nv)
         free = rng.standard_normal(nv)
         soft = rng.uniform(0.05, 0.2, m)
@@ -122,7 +125,11 @@ def directions(problem, rng):
     if problem.generalized is not None:
         g = problem.generalized
         mass = rng.standard_normal((g.nv, g.nv))
-        return out | {"v_free": rng.standard_normal(g.nv), "J": rng.standard_normal((m, g.nv)), "M": mass + mass.T}
+        return out | {
+            "v_free": rng.standard_normal(g.nv),
+            "J": rng.standard_normal((m, g.nv)),
+            "M": mass + mass.T,
+        }
     return out | {"v_free": rng.standard_normal(problem.rows.v_free.shape)}
 
 
@@ -148,7 +155,9 @@ def moved(problem, name, change, h):
         ratio = np.where(two, both[:, 1] / np.where(mu > 0.0, mu, 1.0), c.patch_radius)
         return replace(p, cones=replace(c, mu=mu, patch_radius=ratio))
     if name == "bounds":
-        return replace(p, cones=replace(c, lower=c.lower + h * change[0], upper=c.upper + h * change[1]))
+        return replace(
+            p, cones=replace(c, lower=c.lower + h * change[0], upper=c.upper + h * change[1])
+        )
     if name == "A":
         a = p.dense() + h * change
         return replace(p, matrix=a if isinstance(p.matrix, np.ndarray) else type(p.matrix)(a))

@@ -28,7 +28,11 @@ def draw_bounds(rng, m):
 
 def draw_rows(rng, m, n):
     """Draw J (m, n): whole numbers, which tie, or normal ones; rows are repeated, summed, or scaled by decades."""
-    jac = rng.integers(-2, 3, (m, n)).astype(float) if rng.random() < 0.5 else rng.standard_normal((m, n))
+    jac = (
+        rng.integers(-2, 3, (m, n)).astype(float)
+        if rng.random() < 0.5
+        else rng.standard_normal((m, n))
+    )
     jac *= rng.random((m, n)) < rng.choice([0.2, 0.5, 1.0])
     for _ in range(int(rng.integers(0, m + 1))):
         i, j, k = rng.integers(0, m, 3)
@@ -81,7 +85,10 @@ def draw_body_problem(seed):
     scale = 10.0 ** (rng.integers(-6, 7, 5) if rng.random() < 0.3 else np.zeros(5)) * ~stands
     free = rows.v_free * rng.choice([0.0, 1.0, 1e3], 5)[:, None]
     rows = replace(
-        rows, inv_mass=rows.inv_mass * scale, inv_inertia=rows.inv_inertia * scale[:, None, None], v_free=free
+        rows,
+        inv_mass=rows.inv_mass * scale,
+        inv_inertia=rows.inv_inertia * scale[:, None, None],
+        v_free=free,
     )
     target = draw_rhs(rng, problem.m) if rng.random() < 0.5 else np.zeros(problem.m)
     problem = lv.Problem.from_rows(

@@ -23,7 +23,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 L = np.longdouble
-ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = 0, 1, 2, 3, 4, 5, 7
+ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    7,
+)
 NORMAL = L(2.0) ** -1022
 LEAST = L(1e-60)  # below which a row of A is empty
 U = L(2.0) ** -53
@@ -130,10 +138,17 @@ def spec_of(problem):
     spec["compliance"] = problem.compliance.tolist()
     if problem.operator == "generalized":
         g = problem.generalized
-        given = {"J": g.jac.toarray(), "M": g.mass.toarray(), "v_free": g.v_free, "target": np.zeros(problem.m)}
+        given = {
+            "J": g.jac.toarray(),
+            "M": g.mass.toarray(),
+            "v_free": g.v_free,
+            "target": np.zeros(problem.m),
+        }
         return spec | {"operator": "general"} | {key: x.tolist() for key, x in given.items()}
     rows = {f.name: getattr(problem.rows, f.name) for f in fields(problem.rows)}
-    return spec | {"rows": {key: x.tolist() for key, x in rows.items() if isinstance(x, np.ndarray)}}
+    return spec | {
+        "rows": {key: x.tolist() for key, x in rows.items() if isinstance(x, np.ndarray)}
+    }
 
 
 class Problem:
@@ -162,7 +177,9 @@ class Problem:
         self.roundings = self.m + 20
         self.of_factor = ZERO
         if general:
-            self._of_general(jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L))
+            self._of_general(
+                jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L)
+            )
         elif "rows" in spec:
             self._of_rows(spec)
         else:
@@ -195,7 +212,9 @@ class Problem:
         self.empty = big < LEAST
         self.d = self._filled(d, ~self.empty)
         self.nu = self.d.copy()
-        self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big)) or self._at_least(big)
+        self.d_edge = bool(
+            np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big)
+        ) or self._at_least(big)
 
     def _filled(self, d, held):
         # where a row counts as empty, the mean of those that are held
@@ -228,7 +247,13 @@ class Problem:
             slides = len(rows) - (kind[k] == CONTACT_SPIN)
             if kind[k] == CONTACT_ROLLING:
                 slides = 3
-            turns = axes if len(rows) - slides == 3 else axes[:1] if len(rows) - slides == 1 else axes[1:]
+            turns = (
+                axes
+                if len(rows) - slides == 3
+                else axes[:1]
+                if len(rows) - slides == 1
+                else axes[1:]
+            )
             for q, row in enumerate(rows):
                 for sign, arm, body in (
                     (-1, r["arm_a"][c], r["contact_body"][c][0]),
@@ -248,10 +273,18 @@ class Problem:
                         size[row, body, :3] = 1.0
                         size[row, body, 3:] = reach
         free = np.array(r["v_free"], L).ravel()
-        self.terms = np.abs(self.b + jac.reshape(m, 6 * n) @ free) + np.abs(jac.reshape(m, 6 * n)) @ np.abs(free)
+        self.terms = np.abs(self.b + jac.reshape(m, 6 * n) @ free) + np.abs(
+            jac.reshape(m, 6 * n)
+        ) @ np.abs(free)
         self.touches = np.zeros((m, n), bool)  # bodies of each row
-        for k, pair in enumerate([*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]):
-            moving = [i for i in pair if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))]
+        for k, pair in enumerate(
+            [*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]
+        ):
+            moving = [
+                i
+                for i in pair
+                if i >= 0 and (r["inv_mass"][i] != 0 or np.any(r["inv_inertia"][i] != 0))
+            ]
             self.touches[ptr[k] : ptr[k + 1], moving] = True
         minv, minv_size = np.zeros((n, 6, 6), L), np.zeros((n, 6, 6), L)
         for i in range(n):
@@ -270,7 +303,9 @@ class Problem:
         d = np.diag(self.A).copy()
         self.empty = d < LEAST
         self.d = self._filled(d, ~self.empty)
-        self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))) or self._at_least(d)
+        self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))) or self._at_least(
+            d
+        )
         self.nu = self.d.copy()
         for j in range(joints):
             for row in range(r["joint_ptr"][j], r["joint_ptr"][j + 1]):
@@ -360,7 +395,9 @@ class Problem:
     def _islands(self):
         """Masks (n, m) of rows whose blocks share what they touch, directly or through others."""
         ptr = self.cones["ptr"]
-        touch = np.array([self.touches[ptr[k] : ptr[k + 1]].any(axis=0) for k in range(len(ptr) - 1)])
+        touch = np.array(
+            [self.touches[ptr[k] : ptr[k + 1]].any(axis=0) for k in range(len(ptr) - 1)]
+        )
         label = np.full(len(ptr) - 1, -1)
         for k in range(len(label)):
             if label[k] >= 0:
@@ -450,7 +487,9 @@ class Problem:
                         break
                     high = 2 * high
                 rise = high
-                while low < (half := (low + high) / 2) < high:  # to the last bit, however small it is beside `high`
+                while (
+                    low < (half := (low + high) / 2) < high
+                ):  # to the last bit, however small it is beside `high`
                     rise = half
                     low, high = (rise, high) if excess(rise) > 0 else (low, rise)
                 top = base + rise
@@ -482,7 +521,18 @@ class Problem:
         lam = np.array(impulse, L) / self.stretch
         if not np.isfinite(lam).all():
             return Judgement(
-                np.inf, 0.0, 0.0, 0.0, np.inf, np.inf, np.inf, False, np.inf, np.zeros(0), np.zeros(0), np.zeros(0)
+                np.inf,
+                0.0,
+                0.0,
+                0.0,
+                np.inf,
+                np.inf,
+                np.inf,
+                False,
+                np.inf,
+                np.zeros(0),
+                np.zeros(0),
+                np.zeros(0),
             )
         with np.errstate(all="ignore"):
             return self._judge(lam)
@@ -498,7 +548,11 @@ class Problem:
         error0 = self.error(start, slack0)
         line = L(2.0) ** -48 * np.abs(self.b)
         # Errors of the start at the line below which they are rounding, or so small that a product of them vanishes.
-        at_line = (self.d * np.abs(error0) >= line / 16) & (self.d * np.abs(error0) <= 16 * line) & (line > 0)
+        at_line = (
+            (self.d * np.abs(error0) >= line / 16)
+            & (self.d * np.abs(error0) <= 16 * line)
+            & (line > 0)
+        )
         nothing = bool(at_line.any())
         f = L(2.0) ** -53 * size
         held = self._held(lam, w, L(2.0) ** -53 * (self.size @ np.abs(lam) + np.abs(self.b)))
@@ -519,11 +573,15 @@ class Problem:
                     out.append(self._by_scale(rows, f / self.d, scale))
                 continue
             if reference is None:  # no row acts: each is compared with its own terms
-                own = (self._own_floor(~held * f, k, row, whole[0]) for k, row in self._rows_of(rows))
+                own = (
+                    self._own_floor(~held * f, k, row, whole[0]) for k, row in self._rows_of(rows)
+                )
                 relatives.append(self._by_rows(rows, error, whole[0]))
                 floors.append(max(own, default=ZERO))
                 allows.append(self._by_rows(rows, more / self.d, whole[0]))
-                losses.append(self._by_rows(rows, self.of_factor * (f + rounded) / self.d, whole[0]))
+                losses.append(
+                    self._by_rows(rows, self.of_factor * (f + rounded) / self.d, whole[0])
+                )
                 continue
             nothing |= bool(0 < reference[0] <= LEAST * np.sqrt(self.d.sum()))
             nothing |= bool(0 < reference[1] <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
@@ -536,7 +594,9 @@ class Problem:
             relatives.append(relative)
             floors.append(floor)
             allows.append(self._ratio(*self._floor(rows * more), *reference))
-            losses.append(self._ratio(*self._floor(rows * self.of_factor * (f + rounded)), *reference))
+            losses.append(
+                self._ratio(*self._floor(rows * self.of_factor * (f + rounded)), *reference)
+            )
         relative, allowed, unrefined = (max(x, default=ZERO) for x in (relatives, allows, losses))
         floor = floors[int(np.argmax(relatives))] if relatives else ZERO
         scales = [x for reference in references if reference is not None for x in reference]
@@ -555,7 +615,9 @@ class Problem:
             span,
             np.array(relatives, float),
             np.array(floors, float),
-            np.array([100 * floor + loss for floor, loss in zip(floors, losses, strict=True)], float),
+            np.array(
+                [100 * floor + loss for floor, loss in zip(floors, losses, strict=True)], float
+            ),
         )
 
     def _reference(self, rows, start, slack, error):
@@ -602,8 +664,14 @@ class Problem:
             line = L(2.0) ** -48 * np.where(np.isfinite(terms), terms, ZERO)
             is_edge |= bool(np.any(empty & (line > 0) & (own > line / 16) & (own < 16 * line)))
             s = np.where(own > line, own, terms)
-            is_edge |= bool(np.any(empty & (np.abs(self.b[part]) > tiny / 4) & (np.abs(self.b[part]) < 4 * tiny)))
-            out[part] = np.where(empty, np.where(np.abs(self.b[part]) <= tiny, L(np.inf), s), np.nan)
+            is_edge |= bool(
+                np.any(
+                    empty & (np.abs(self.b[part]) > tiny / 4) & (np.abs(self.b[part]) < 4 * tiny)
+                )
+            )
+            out[part] = np.where(
+                empty, np.where(np.abs(self.b[part]) <= tiny, L(np.inf), s), np.nan
+            )
         return out, is_edge
 
     def _by_scale(self, rows, error, scale):
@@ -633,7 +701,13 @@ class Problem:
         own = np.abs(self.b[first]) if self.b[first] != 0 else self.terms[first]
         if own > 0:
             return f[row] * np.sqrt(self.d[first] / self.d[row]) / own
-        return ZERO if f[row] == 0 else f[row] / np.sqrt(self.d[row]) / (4 * U * whole) if whole > 0 else L(np.inf)
+        return (
+            ZERO
+            if f[row] == 0
+            else f[row] / np.sqrt(self.d[row]) / (4 * U * whole)
+            if whole > 0
+            else L(np.inf)
+        )
 
     def _held(self, lam, w, rounding):
         """(m,) rows whose slack holds them at their bound, a contact at zero impulse, by more than its rounding."""
@@ -669,7 +743,9 @@ class Problem:
             if not rows[ptr[k]]:
                 continue
             size = np.sqrt(self.d[part]) * np.abs(error[part])
-            own = np.where(self.b[part] != 0, np.abs(self.b[part]), self.terms[part]) / np.sqrt(self.d[part])
+            own = np.where(self.b[part] != 0, np.abs(self.b[part]), self.terms[part]) / np.sqrt(
+                self.d[part]
+            )
             if kind[k] != ROW:
                 size = np.sqrt((size**2).sum())[None]
                 own = own[:1]
@@ -688,7 +764,9 @@ class Problem:
         return np.sqrt((f * f / self.d).sum()), (f * np.sqrt(self.nu / self.d)).max(initial=ZERO)
 
     def _ratio(self, x, y, x0, y0):
-        return max(ZERO if a == 0 else (a / a0 if a0 > 0 else L(np.inf)) for a, a0 in ((x, x0), (y, y0)))
+        return max(
+            ZERO if a == 0 else (a / a0 if a0 > 0 else L(np.inf)) for a, a0 in ((x, x0), (y, y0))
+        )
 
     def _bounded(self):
         c = self.cones
@@ -725,7 +803,9 @@ class Problem:
         """Whether rounding of the data explains what A^T y pulls along a contact's cone."""
         if self.operator == "matrix":
             limit = share * np.sqrt(self.d[part]) * (np.sqrt(self.d) @ np.abs(y))
-            return slack <= limit[0] + sum(reach * np.sqrt(limit[at] @ limit[at]) for at, reach in parts)
+            return slack <= limit[0] + sum(
+                reach * np.sqrt(limit[at] @ limit[at]) for at, reach in parts
+            )
         along = np.zeros(self.m, L)
         along[part.start] = slack
         return bool(self._rounds(y, along, share)[part.start])
@@ -753,11 +833,17 @@ class Problem:
             part = slice(c["ptr"][k], c["ptr"][k + 1])
             if c["kind"][k] == ROW:
                 low, high = np.array(c["lower"][part], L), np.array(c["upper"][part], L)
-                if np.any((y[part] > 0) & np.isfinite(high)) or np.any((y[part] < 0) & np.isfinite(low)):
+                if np.any((y[part] > 0) & np.isfinite(high)) or np.any(
+                    (y[part] < 0) & np.isfinite(low)
+                ):
                     return "y leaves the bounds"
                 low = np.maximum(low, -LARGEST)
                 high = np.minimum(high, LARGEST)
-                pull += sum(x * (h if x > 0 else lo) for x, lo, h in zip(z[part], low, high, strict=True) if x != 0)
+                pull += sum(
+                    x * (h if x > 0 else lo)
+                    for x, lo, h in zip(z[part], low, high, strict=True)
+                    if x != 0
+                )
                 continue
             yk, zk = y[part], z[part]
             parts = self.parts(k)

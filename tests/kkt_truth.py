@@ -109,4 +109,9 @@ def relative_of_program(qp, answer):
     objective = abs(0.5 * x @ px + qp["q"] @ x)
     tiny = 1e-300
     gap = abs(value) / max(objective, tiny) if value else 0.0
-    return max(short) / max(size), np.abs(force).max() / max(*forces, tiny), gap, objective / max(terms, tiny)
+    return (
+        max(short) / max(size),
+        np.abs(force).max() / max(*forces, tiny),
+        gap,
+        objective / max(terms, tiny),
+    )

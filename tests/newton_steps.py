@@ -14,7 +14,9 @@ class NewtonSteps:
     """`step` after `step`; how each solve ended is in `ended` (0: short of tol), the last answer in `told`."""
 
     def __init__(self, name, *, warm_start=True, tol=TOL, **parameters):
-        scene = lv.Scene(name, solver="newton", warm_start=warm_start, solver_iterations=16, **parameters)
+        scene = lv.Scene(
+            name, solver="newton", warm_start=warm_start, solver_iterations=16, **parameters
+        )
         self.simulation = lv.Simulation(scene)
         self.substeps = scene.parameters.substeps
         self.tol = tol

@@ -94,7 +94,9 @@ def touching(contact_body, **fields):
     return Rows(**defaults | fields)
 
 
-def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, rolling=False, **sizes):
+def random_contact_problem(
+    seed, friction="coulomb", tangents=None, spin=True, rolling=False, **sizes
+):
     """Draw a problem of bodies with free and bounded joint rows, and contacts.
 
     `tangents` is the number of tangents of each contact; None mixes 0, 1 and 2. `sizes` are the numbers of bodies,
@@ -128,7 +130,12 @@ def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, r
 def as_matrix(problem):
     """Return the same problem with A as a sparse matrix."""
     return Problem(
-        problem.b, problem.cones, problem.delassus(), friction=problem.friction, guess=problem.guess, name=problem.name
+        problem.b,
+        problem.cones,
+        problem.delassus(),
+        friction=problem.friction,
+        guess=problem.guess,
+        name=problem.name,
     )
 
 
@@ -161,7 +168,9 @@ def random_ellipse_friction_contacts(seed, friction="coulomb", **sizes):
     """Draw the problem of `random_box_friction_contacts` with an ellipse instead of each box."""
     base = random_box_friction_contacts(seed, friction, **sizes)
     c = base.cones
-    return replace(base, cones=replace(c, kind=np.where(c.kind == CONTACT_BOX, CONTACT_ELLIPSE, c.kind)))
+    return replace(
+        base, cones=replace(c, kind=np.where(c.kind == CONTACT_BOX, CONTACT_ELLIPSE, c.kind))
+    )
 
 
 #: Name of each form of A -> function that converts a problem of bodies to this form.
@@ -186,7 +195,9 @@ CONES = {
     "box": lambda mu, arm: Cones.contacts(np.stack([mu, 2.0 * arm], 1), shape="box"),
     "ellipse": lambda mu, arm: Cones.contacts(np.stack([mu + 0.1, 0.3 + 0.5 * arm], 1)),
     "rolling": lambda mu, arm: Cones.contacts(mu, rolling=arm),
-    "rolling and spin": lambda mu, arm: Cones.contacts(mu, patch_radius=0.2 + 0.0 * mu, rolling=arm),
+    "rolling and spin": lambda mu, arm: Cones.contacts(
+        mu, patch_radius=0.2 + 0.0 * mu, rolling=arm
+    ),
     "round": lambda mu, arm: Cones.contacts(mu, 5),
 }
 
@@ -210,7 +221,9 @@ def random_lcp(seed, m=12, rank=None, boxed=True):
     # Choose b as a vector in the range of A minus a non-negative vector: the problem then has a solution even if A is
     # singular.
     a = g @ g.T
-    return Problem.lcp(a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}")
+    return Problem.lcp(
+        a, a @ rng.normal(size=m) - rng.uniform(0.0, 1.0, m), upper=high, name=f"lcp {seed}"
+    )
 
 
 # -- generalized coordinates: kinematic trees, their mass matrices, rows on chains ------------------------
@@ -242,7 +255,9 @@ def ancestors(parent, i):
     return chain
 
 
-def random_generalized_problem(seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False):
+def random_generalized_problem(
+    seed, friction="cone", n=14, compliance=True, contacts=5, tangents=2, spin=False
+):
     """Draw J and M of a random forest with free and bounded rows and contacts, each row on one or two chains."""
     rng = np.random.default_rng(seed)
     parent = random_tree_parents(rng, n)
@@ -292,7 +307,9 @@ def make_well_posed_problem(law, rows):
     elif law == "lcp":
         problem = add_compliance(random_contact_problem(22, tangents=0, spin=False), 0.3)
     else:
-        problem = add_compliance(random_contact_problem(23, friction=law, tangents=2, spin=False), 0.3)
+        problem = add_compliance(
+            random_contact_problem(23, friction=law, tangents=2, spin=False), 0.3
+        )
     return problem if rows else as_matrix(problem)
 
 
@@ -309,7 +326,9 @@ def make_problems_of_every_kind():
     """Return {(law, kind of block): (a well-posed problem in each form of A, its slack (m,) [m/s])}."""
     problems = {}
     for law in ("linear", "lcp"):
-        problems[law, "rows"] = [convert(make_well_posed_problem(law, True)) for convert in FORMS.values()]
+        problems[law, "rows"] = [
+            convert(make_well_posed_problem(law, True)) for convert in FORMS.values()
+        ]
     for law, (kind, draw) in itertools.product(("coulomb", "cone"), CONTACTS.items()):
         soft = add_compliance(draw(23, law), 0.3)
         problems[law, kind] = [convert(soft) for convert in FORMS.values()]
@@ -351,11 +370,19 @@ def with_ground_as_body(problem):
         for name in ("joint_body", "contact_body")
     }
     bodies = replace(rows, **ground, **pairs)
-    return lv.Problem(problem.b, problem.cones, rows=bodies, compliance=problem.compliance, friction=problem.friction)
+    return lv.Problem(
+        problem.b,
+        problem.cones,
+        rows=bodies,
+        compliance=problem.compliance,
+        friction=problem.friction,
+    )
 
 
 #: And by a dense matrix with a guess.
-GIVEN = FORMS | {"dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))}
+GIVEN = FORMS | {
+    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
+}
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -369,7 +396,12 @@ def dragged(seed, contacts, mu=None, shape="disk", friction="coulomb"):
     target[::3] += 1.0
     cones = lv.Cones.contacts(mu, shape=shape, count=contacts if np.ndim(mu) == 0 else None)
     return lv.Problem.from_jacobian(
-        rng.normal(size=(m, nv)), np.eye(nv), rng.normal(size=nv), target=target, cones=cones, friction=friction
+        rng.normal(size=(m, nv)),
+        np.eye(nv),
+        rng.normal(size=nv),
+        target=target,
+        cones=cones,
+        friction=friction,
     )
 
 
@@ -454,7 +486,9 @@ def nearly_singular(seed):
         cones = lv.Cones.contacts(rng.uniform(0.0, 1.2, int(rng.integers(1, 6))))
     else:
         m = int(rng.integers(1, nv + 3))
-        cones = lv.Cones.bounded(np.where((law == "lcp") & (rng.random(m) < 0.5), 0.0, -np.inf), np.full(m, np.inf))
+        cones = lv.Cones.bounded(
+            np.where((law == "lcp") & (rng.random(m) < 0.5), 0.0, -np.inf), np.full(m, np.inf)
+        )
     jac = rng.normal(size=(cones.n_rows, nv))
     if rng.random() < 0.3:
         jac[rng.random(jac.shape) < 0.5] = 0.0

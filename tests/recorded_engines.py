@@ -118,7 +118,9 @@ def make_newton_mujoco(cone="elliptic", n=3, **changes):
             values.append(np.array(getattr(data, name)))
     kinds = dict.fromkeys(("type", "worldid", "efc_address", "dim"), np.int32)
     arrays = {k: Recorded(np.array(v).astype(kinds.get(k, np.float32))) for k, v in efc.items()}
-    contacts = {k: Recorded(np.concatenate(v).astype(kinds.get(k, np.float32))) for k, v in contact.items()}
+    contacts = {
+        k: Recorded(np.concatenate(v).astype(kinds.get(k, np.float32))) for k, v in contact.items()
+    }
     others = {k: np.array(v, np.float32) for k, v in rest.items()}
     others = {k: Recorded(changes.get(k, lambda x: x)(x)) for k, x in others.items()}
     data = SimpleNamespace(

@@ -18,7 +18,9 @@ def stack(n=6, name="stack", **more):
 def moving_stack(steps, n=10):
     """A stack whose load changes slowly, as in consecutive steps."""
     p = stack(n)
-    return [lv.Problem.lcp(p.matrix, p.b * (1.0 + 1e-3 * i), name=f"step {i}") for i in range(steps)]
+    return [
+        lv.Problem.lcp(p.matrix, p.b * (1.0 + 1e-3 * i), name=f"step {i}") for i in range(steps)
+    ]
 
 
 def bricks(layers, noise, seed=0):

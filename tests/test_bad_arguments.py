@@ -28,8 +28,12 @@ class Call:
     function: Callable[..., Any]
     arguments: dict[str, Any]
     accepts_nan: bool = False  # measures and batches report NaN in their results
-    any_length: tuple[str, ...] = ()  # arguments whose length (or number of dimensions) is not fixed
-    names: dict[str, str] = field(default_factory=dict)  # argument -> pattern of its name in messages, if another
+    any_length: tuple[
+        str, ...
+    ] = ()  # arguments whose length (or number of dimensions) is not fixed
+    names: dict[str, str] = field(
+        default_factory=dict
+    )  # argument -> pattern of its name in messages, if another
 
     def __call__(self, **changed: Any) -> Any:
         return self.function(**self.arguments | changed)
@@ -86,10 +90,14 @@ def name_call(function):
 def add(values, *functions, **options):
     """Add calls of functions, or of pairs (name, function), with the values of their own parameters."""
     for function in functions:
-        name, function = function if isinstance(function, tuple) else (name_call(function), function)
+        name, function = (
+            function if isinstance(function, tuple) else (name_call(function), function)
+        )
         parameters = inspect.signature(function).parameters
         given = {k: values[k] for k in values if k in parameters or "changes" in parameters}
-        CALLS[name if name not in CALLS else f"{name}, {len(CALLS)}"] = Call(function, given, **options)
+        CALLS[name if name not in CALLS else f"{name}, {len(CALLS)}"] = Call(
+            function, given, **options
+        )
 
 
 def builder_of(method, **arguments):
@@ -103,7 +111,9 @@ def read_builder(method, **arguments):
     """Call a method that reads from a builder with one contact."""
     builder = lv.RowBuilder(ONES, ONES, np.zeros((2, 3)), 0.01, PLACES[:, :2])
     builder.contact(0, 1, AT[:2], AXIS[:2] / 0.6)
-    arguments = {"problem": builder.problem()} | arguments if method == "velocity_after" else arguments
+    arguments = (
+        {"problem": builder.problem()} | arguments if method == "velocity_after" else arguments
+    )
     return getattr(builder, method)(**arguments)
 
 
@@ -142,7 +152,9 @@ ROW_ARRAYS = {f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "
 GENERAL = lv.Problem.from_jacobian(EYE, A, B, cones=lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]))
 EXACT = lv.solve(GENERAL, tol=1e-12)
 SLIDING = lv.Cones.contacts(0.5, tangents=1)
-STEP = lv.Problem.from_jacobian(np.eye(3)[[2, 0, 1]], np.eye(3), [0.5, 0.0, -1.0], cones=lv.Cones.contacts(0.2))
+STEP = lv.Problem.from_jacobian(
+    np.eye(3)[[2, 0, 1]], np.eye(3), [0.5, 0.0, -1.0], cones=lv.Cones.contacts(0.2)
+)
 WORLDS = {
     "J": np.array([EYE] * 2),
     "M": np.array([A] * 2),
@@ -207,13 +219,21 @@ add(LIMITS | {"problem": LCP, "solvers": ["pgs"], "reference": "direct"}, lv.cro
 add({"problem": GENERAL, "velocity": B}, io.reconstruct)
 add({"b": B}, lv.prepare(LCP, "pgs").solve)
 add({"v_free": B}, lv.prepare(GENERAL).solve)
-add({"problem": LCP, "impulse": B, "precision": "float32", "threshold": 1e-6}, lv.residual, accepts_nan=True)
+add(
+    {"problem": LCP, "impulse": B, "precision": "float32", "threshold": 1e-6},
+    lv.residual,
+    accepts_nan=True,
+)
 add({"name": "pgs"}, lv.get)
 add({"against": "time"}, lv.solve(LCP, "pgs", history=True).history.plot)
 add({"rows": 5}, lv.solve(LCP).plot)
 add({"i": 0}, lv.solve(LCP).state)
 add({"spec": lv.get("pgs"), "replace": True}, lv.register)
-for _name, _option, _value in (("jacobi", "omega", 0.5), ("sor", "omega", 1.5), ("anderson", "memory", 3)):
+for _name, _option, _value in (
+    ("jacobi", "omega", 0.5),
+    ("sor", "omega", 1.5),
+    ("anderson", "memory", 3),
+):
     _problem = lv.Problem.linear(A, B) if _name == "sor" else LCP
     CALLS[f"solve, {_name}"] = Call(partial(lv.solve, _problem, _name), {_option: _value})
 CALLS["solve, random order"] = Call(partial(lv.solve, LCP, "pgs", order="random"), {"seed": 7})
@@ -230,7 +250,13 @@ add(
     lv.Cones,
 )
 add(
-    {"mu": np.array([0.5, 0.2]), "tangents": 2, "patch_radius": ONES, "rolling": ONES, "shape": "disk"},
+    {
+        "mu": np.array([0.5, 0.2]),
+        "tangents": 2,
+        "patch_radius": ONES,
+        "rolling": ONES,
+        "shape": "disk",
+    },
     lv.Cones.contacts,
 )
 add(
@@ -240,10 +266,18 @@ add(
     lv.Cones.contacts(0.5, count=2).shaped,
 )
 add({"blocks": np.array([1, 0])}, CONTACT.cones.select, any_length=("blocks",))
-add({"J": EYE, "M": A, "v_free": B, "target": B, "lower": B, "upper": B}, lv.derivative(GENERAL, EXACT).jvp)
+add(
+    {"J": EYE, "M": A, "v_free": B, "target": B, "lower": B, "upper": B},
+    lv.derivative(GENERAL, EXACT).jvp,
+)
 add({"velocity": B, "impulse": B, "slack": B}, lv.derivative(GENERAL, EXACT).vjp)
 add(
-    {"problem": GENERAL, "solution": EXACT.impulse, "problems": [GENERAL], "solutions": [EXACT.impulse]},
+    {
+        "problem": GENERAL,
+        "solution": EXACT.impulse,
+        "problems": [GENERAL],
+        "solutions": [EXACT.impulse],
+    },
     lv.derivative,
     lv.derivatives,
 )
@@ -255,7 +289,10 @@ add({"jac": EYE, "mass": A, "v_free": B, "names": ["x", "y"]}, lv.Generalized, a
 add({"jac": sp.csr_array(EYE), "mass": sp.csr_array(A), "v_free": B}, lv.Generalized)
 add(
     dict.fromkeys(("target", "impulse", "v"), B),
-    *(getattr(GENERAL.generalized, k) for k in ("bias", "change", "force", "momentum_of", "velocity_of")),
+    *(
+        getattr(GENERAL.generalized, k)
+        for k in ("bias", "change", "force", "momentum_of", "velocity_of")
+    ),
     accepts_nan=True,
 )
 add(
@@ -278,9 +315,17 @@ add(
     lv.Problem,
 )
 add({"b": B, "cones": lv.Cones.free(2), "matrix": sp.csr_array(A)}, lv.Problem)
-CALLS["Problem, not copied"] = Call(partial(lv.Problem, copy=False), {"b": B, "cones": lv.Cones.free(2), "matrix": A})
-add({"A": np.eye(8), "b": np.ones(8), "mu": np.array([0.5, 0.2]), "patch_radius": ONES}, lv.Problem.contact)
-add({"A": np.eye(10), "b": np.ones(10), "mu": np.array([0.5, 0.2]), "rolling": ONES}, lv.Problem.contact)
+CALLS["Problem, not copied"] = Call(
+    partial(lv.Problem, copy=False), {"b": B, "cones": lv.Cones.free(2), "matrix": A}
+)
+add(
+    {"A": np.eye(8), "b": np.ones(8), "mu": np.array([0.5, 0.2]), "patch_radius": ONES},
+    lv.Problem.contact,
+)
+add(
+    {"A": np.eye(10), "b": np.ones(10), "mu": np.array([0.5, 0.2]), "rolling": ONES},
+    lv.Problem.contact,
+)
 add(
     {
         "A": np.eye(3),
@@ -291,7 +336,11 @@ add(
     },
     lv.Problem.from_findex,
 )
-add({"findex": np.array([-1, 0, 0])}, ("Problem.findex_order", lv.Problem.findex_order), any_length=("findex",))
+add(
+    {"findex": np.array([-1, 0, 0])},
+    ("Problem.findex_order", lv.Problem.findex_order),
+    any_length=("findex",),
+)
 add(
     {
         "rows": ROWS,
@@ -324,7 +373,10 @@ add(
     GENERAL.velocity,
     GENERAL.energy_change,
 )
-add({"J": sp.csr_array(EYE), "M": [np.eye(1)] * 2, "v_free": B, "cones": lv.Cones.free(2)}, lv.Problem.from_jacobian)
+add(
+    {"J": sp.csr_array(EYE), "M": [np.eye(1)] * 2, "v_free": B, "cones": lv.Cones.free(2)},
+    lv.Problem.from_jacobian,
+)
 add(
     {
         "P": A,
@@ -352,7 +404,8 @@ add(ROW_ARRAYS, lv.Rows)
 add(WORLDS, lv.Batch, accepts_nan=True)
 CALLS["Batch, solved"] = Call(lambda **more: lv.solve_many(lv.Batch(**more)), WORLDS)
 add(
-    {k: WORLDS[k] for k in ("J", "M", "v_free")} | {"cones": lv.Cones.free(3), "count": np.array([1, 2])},
+    {k: WORLDS[k] for k in ("J", "M", "v_free")}
+    | {"cones": lv.Cones.free(3), "count": np.array([1, 2])},
     lv.Batch,
     accepts_nan=True,
 )
@@ -370,7 +423,11 @@ add(
     any_length=("J", "M", "v_free"),
 )
 TRIANGLES = WORLDS | {"M": (np.ones((2, 2)), np.array([0, 1]), np.array([0, 1, 2]))}
-add({k: TRIANGLES[k] for k in ("J", "M", "v_free", "cones")}, ("Batch, triangles", lv.Batch), accepts_nan=True)
+add(
+    {k: TRIANGLES[k] for k in ("J", "M", "v_free", "cones")},
+    ("Batch, triangles", lv.Batch),
+    accepts_nan=True,
+)
 add(
     {"i": np.array([0, 1])},
     BATCH.__getitem__,
@@ -379,7 +436,9 @@ add(
     any_length=("i",),
 )
 CALLS["Batch.flatten_impulses"] = Call(
-    lambda given: BATCH.flatten_impulses("impulse", given), {"given": np.ones((2, 2))}, accepts_nan=True
+    lambda given: BATCH.flatten_impulses("impulse", given),
+    {"given": np.ones((2, 2))},
+    accepts_nan=True,
 )
 add(
     {
@@ -395,11 +454,20 @@ add(
 )
 add({"problems": [LCP, LCP], "impulses": [B, B]}, lv.residual_many)
 add(
-    {"problems": BATCH, "solver": "auto", "impulse": np.ones((2, 2)), "threads": 2, "errors": "raise"} | LIMITS,
+    {
+        "problems": BATCH,
+        "solver": "auto",
+        "impulse": np.ones((2, 2)),
+        "threads": 2,
+        "errors": "raise",
+    }
+    | LIMITS,
     lv.solve_many,
 )
 add({"problems": [LCP, LCP], "impulses": [B, None]} | LIMITS, lv.solve_many)
-CALLS["solve_many, one start"] = Call(lambda xs: lv.solve_many([LCP] * 2, "pgs", impulses=[xs, None]), {"xs": B})
+CALLS["solve_many, one start"] = Call(
+    lambda xs: lv.solve_many([LCP] * 2, "pgs", impulses=[xs, None]), {"xs": B}
+)
 CALLS["solve_many, nothing"] = Call(lambda **more: lv.solve_many([], **more), LIMITS)
 add(
     {
@@ -414,7 +482,13 @@ add(
     lv.RowBuilder,
 )
 add(
-    {"inv_mass": ONES, "inv_inertia": ONES, "velocity": np.zeros((2, 3)), "dt": 0.01, "position": PLACES[:, :2]},
+    {
+        "inv_mass": ONES,
+        "inv_inertia": ONES,
+        "velocity": np.zeros((2, 3)),
+        "dt": 0.01,
+        "position": PLACES[:, :2],
+    },
     lv.RowBuilder,
 )
 OF_BLOCK = {
@@ -448,7 +522,10 @@ add(
 PAIR = {"a": 0, "b": 1, "feature": 3, "axis": AXIS}
 add(PAIR | {"speed": 1.0, "max_torque": 2.0}, like(lv.RowBuilder, "motor", builder_of))
 add(PAIR | {"speed": 1.0, "max_force": 2.0, "anchor": AT}, like(lv.RowBuilder, "motor", builder_of))
-add(PAIR | {"value": 0.5, "lower": 0.0, "upper": 1.0, "anchor": AT}, like(lv.RowBuilder, "limit", builder_of))
+add(
+    PAIR | {"value": 0.5, "lower": 0.0, "upper": 1.0, "anchor": AT},
+    like(lv.RowBuilder, "limit", builder_of),
+)
 add(
     {
         "bodies": [(-1, 0), (0, 1)],
@@ -489,7 +566,12 @@ add(
 # -- what measures -----------------------------------------------------------------------------------------------------
 
 add(
-    {"problem": CONTACT, "impulse": np.zeros(CONTACT.m), "velocity": CONTACT.rows.v_free, "gap": np.zeros(N_CONTACTS)}
+    {
+        "problem": CONTACT,
+        "impulse": np.zeros(CONTACT.m),
+        "velocity": CONTACT.rows.v_free,
+        "gap": np.zeros(N_CONTACTS),
+    }
     | {"gap": np.zeros(len(CONTACT.rows.normal)), "dt": 0.01},
     lv.diagnose,
 )
@@ -548,7 +630,9 @@ EFC = {
 add(EFC, io.from_efc, accepts_nan=True)
 for _k, _name in enumerate(("world", "efc_address", "dim", "friction")):
     CALLS[f"from_efc, {_name} of contacts"] = Call(
-        lambda part, k=_k: io.from_efc(**EFC | {"contacts": (*EFC["contacts"][:k], part, *EFC["contacts"][k + 1 :])}),
+        lambda part, k=_k: io.from_efc(
+            **EFC | {"contacts": (*EFC["contacts"][:k], part, *EFC["contacts"][k + 1 :])}
+        ),
         {"part": np.array(EFC["contacts"][_k])},
         any_length=("part",) if _k == 0 else (),
     )
@@ -571,7 +655,10 @@ OF_BODY = {
     "normal": UP,
     "offset": 0.5,
 }
-add(OF_BODY, *(like(lv.Scene, k, on_scene) for k in ("add_body", "add_box", "add_plane", "add_sphere")))
+add(
+    OF_BODY,
+    *(like(lv.Scene, k, on_scene) for k in ("add_body", "add_box", "add_plane", "add_sphere")),
+)
 add(
     {
         "kind": "hinge",
@@ -610,7 +697,9 @@ CALLS["Scene"] = Call(
     )
     | dict.fromkeys(("substeps", "solver_iterations", "position_iterations", "seed"), 4),
 )
-CALLS["Scene.with_parameters"] = Call(lv.Scene("stack").with_parameters, {"dt": 0.01, "solver_iterations": 8})
+CALLS["Scene.with_parameters"] = Call(
+    lv.Scene("stack").with_parameters, {"dt": 0.01, "solver_iterations": 8}
+)
 add({"scene": "stack", "report_residual": True, "report_motion": True}, lv.Simulation)
 add(
     {
@@ -625,7 +714,14 @@ add(
     },
     *(
         like(lv.Simulation, k, lambda k, **more: getattr(lv.Simulation("stack"), k)(**more))
-        for k in ("reset", "restore", "set_solver_iterations", "set_velocity", "set_warm_start", "step")
+        for k in (
+            "reset",
+            "restore",
+            "set_solver_iterations",
+            "set_velocity",
+            "set_warm_start",
+            "step",
+        )
     ),
 )
 
@@ -727,7 +823,13 @@ def wrong_values(good):
         yield "objects", np.full(good.shape, None)
         yield "masked", np.ma.array(good, mask=first)
     elif isinstance(good, bool):
-        yield from {"text": "no", "a number": 1, "None": None, "a list": [], "an array": np.zeros(2)}.items()
+        yield from {
+            "text": "no",
+            "a number": 1,
+            "None": None,
+            "a list": [],
+            "an array": np.zeros(2),
+        }.items()
     elif isinstance(good, int | float):
         yield from {
             "NaN": np.nan,
@@ -822,9 +924,13 @@ def list_public_calls(module):
         x = getattr(module, name)
         if not callable(x) or (inspect.isclass(x) and issubclass(x, BaseException)):
             continue
-        methods = [k for k in dir(x) if k == "__getitem__" or k[0] != "_"] if inspect.isclass(x) else []
+        methods = (
+            [k for k in dir(x) if k == "__getitem__" or k[0] != "_"] if inspect.isclass(x) else []
+        )
         for key, function in [(name, x), *((f"{name}.{k}", getattr(x, k)) for k in methods)]:
-            if function is not x and not isinstance(inspect.getattr_static(x, key.partition(".")[2]), kinds):
+            if function is not x and not isinstance(
+                inspect.getattr_static(x, key.partition(".")[2]), kinds
+            ):
                 continue
             try:
                 parameters = inspect.signature(function).parameters
@@ -865,14 +971,20 @@ def test_call_with_a_wrong_argument_raises_an_error_that_names_it(name):
             values += [(what, x, elsewhere) for what, x in wrong_shapes(good)]
         values += [(what, x, None) for what, x in odd_values(good)]
         for what, x, names in values:
-            accepted = names is None or (what == "NaN" and call.accepts_nan and isinstance(good, np.ndarray))
+            accepted = names is None or (
+                what == "NaN" and call.accepts_nan and isinstance(good, np.ndarray)
+            )
             accepted = accepted or what in ACCEPTS.get(argument, ())
-            accepted = accepted or (what == "a column" and name in ("Problem.from_qp", "solve_qp"))  # as in qpsolvers
+            accepted = accepted or (
+                what == "a column" and name in ("Problem.from_qp", "solve_qp")
+            )  # as in qpsolvers
             try:
                 call(**{argument: x})
             except lv.LavenderError as error:
                 message = str(error)
-                if names is not None and not any(re.search(rf"\b(?:{word})\b", message) for word in names):
+                if names is not None and not any(
+                    re.search(rf"\b(?:{word})\b", message) for word in names
+                ):
                     wrong.append(f"{argument}: {what}: not named in {message!r}")
                 elif names is not None and not isinstance(error, lv.InputError | lv.UnknownName):
                     wrong.append(f"{argument}: {what}: {type(error).__name__}")
@@ -909,7 +1021,9 @@ LAYOUTS = {
     "columns first": np.asfortranarray,
     "reversed": lambda x: x[::-1].copy()[::-1],
     "read-only": read_only,
-    "at an odd byte": lambda x: np.frombuffer(b" " + x.tobytes(), np.uint8)[1:].view(x.dtype).reshape(x.shape),
+    "at an odd byte": lambda x: (
+        np.frombuffer(b" " + x.tobytes(), np.uint8)[1:].view(x.dtype).reshape(x.shape)
+    ),
     "lists": np.ndarray.tolist,
 }
 
@@ -935,7 +1049,10 @@ def test_call_with_arrays_in_any_memory_layout_has_the_same_result(name):
     for argument, value in call.arguments.items():
         if isinstance(value, np.ndarray):
             for layout, convert in LAYOUTS.items():
-                assert comparable(call(**{argument: convert(value)})) == expected, (argument, layout)
+                assert comparable(call(**{argument: convert(value)})) == expected, (
+                    argument,
+                    layout,
+                )
 
 
 def convert_to_float32(x, order):
@@ -946,18 +1063,25 @@ def convert_to_float32(x, order):
     return x.astype(np.float32).astype(np.dtype(np.float32).newbyteorder(order)) if is_real else x
 
 
-@pytest.mark.parametrize("name", ["Batch", "Batch, triangles", "Problem.from_jacobian", "Rows", "from_efc"])
+@pytest.mark.parametrize(
+    "name", ["Batch", "Batch, triangles", "Problem.from_jacobian", "Rows", "from_efc"]
+)
 @pytest.mark.parametrize("order", "<>")
 def test_call_with_float32_of_either_byte_order_has_single_precision(name, order):
-    result = CALLS[name](**{k: convert_to_float32(x, order) for k, x in CALLS[name].arguments.items()})
+    result = CALLS[name](
+        **{k: convert_to_float32(x, order) for k, x in CALLS[name].arguments.items()}
+    )
     assert getattr(result, "batch", result).precision == "float32"
 
 
 @pytest.mark.parametrize(
-    ("solver", "option"), [(name, option) for name in lv.available(external=False) for option in lv.get(name).options]
+    ("solver", "option"),
+    [(name, option) for name in lv.available(external=False) for option in lv.get(name).options],
 )
 def test_solve_with_a_wrong_option_of_any_solver_raises(solver, option):
-    problem = next(p for p in (LCP, lv.Problem.linear(A, B), CONTACT) if lv.get(solver).refuses(p) is None)
+    problem = next(
+        p for p in (LCP, lv.Problem.linear(A, B), CONTACT) if lv.get(solver).refuses(p) is None
+    )
     for value in ("no such word", np.nan, 1j, {1: 2}):
         with pytest.raises(lv.LavenderError, match=option):
             lv.solve(problem, solver, **{option: value})

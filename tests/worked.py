@@ -55,7 +55,11 @@ def energy(scene, observation):
     for body, x, q, v in zip(scene.bodies, *seen, strict=True):
         if not body.is_static:
             omega = rotation(q).T @ v[3:]
-            total += 0.5 * body.mass * v[:3] @ v[:3] + 0.5 * omega @ body.inertia @ omega - body.mass * g @ x
+            total += (
+                0.5 * body.mass * v[:3] @ v[:3]
+                + 0.5 * omega @ body.inertia @ omega
+                - body.mass * g @ x
+            )
     return total
 
 
@@ -70,7 +74,13 @@ def chromium():
 
 def python(*words, status=0, **more):
     """What became of Python in a process of its own: what crashes or hangs there fails one test alone."""
-    asked = {"capture_output": True, "text": True, "check": False, "cwd": ROOT, "timeout": 1800.0} | more
+    asked = {
+        "capture_output": True,
+        "text": True,
+        "check": False,
+        "cwd": ROOT,
+        "timeout": 1800.0,
+    } | more
     done = subprocess.run([sys.executable, *map(str, words)], **asked)
     assert done.returncode == status, done.stdout + done.stderr
     return done

@@ -20,7 +20,18 @@ import scipy.sparse as sp
 TOLERANCE = 1e-2  # Default tolerances of backends are 1e-3 to 1e-8.
 FAR_BOUNDS = [10.0**k for k in range(3, 20)]
 SMALL_SIZES = [10.0**-k for k in range(1, 11)]
-DENSE_ONLY = ("daqp", "ecos", "quadprog", "jaxopt_osqp", "qpax", "pyqpmad", "hpipm", "nppro", "qpoases", "qpswift")
+DENSE_ONLY = (
+    "daqp",
+    "ecos",
+    "quadprog",
+    "jaxopt_osqp",
+    "qpax",
+    "pyqpmad",
+    "hpipm",
+    "nppro",
+    "qpoases",
+    "qpswift",
+)
 
 
 def run_alone(name, *arguments, **arrays):
@@ -70,11 +81,17 @@ def is_near(x, solution):
 
 
 def find_triangle(name, sparse=None):
-    found = [run_alone(name, P, [-1, -1], sparse, lb=[-9, -9], ub=[9, 9]) for P in ([[2, 1], [0, 2]], [[2, 0], [1, 2]])]
+    found = [
+        run_alone(name, P, [-1, -1], sparse, lb=[-9, -9], ub=[9, 9])
+        for P in ([[2, 1], [0, 2]], [[2, 0], [1, 2]])
+    ]
     if any(isinstance(f, Exception) for f in found):
         return "none"
     sizes = {"both": [1 / 3] * 2, "one": [0.5] * 2, "mean": [0.4] * 2}
-    seen = [next((k for k, v in sizes.items() if is_near(np.ravel(f.x), np.array(v))), "other") for f in found]
+    seen = [
+        next((k for k, v in sizes.items() if is_near(np.ravel(f.x), np.array(v))), "other")
+        for f in found
+    ]
     words = {("both", "one"): "upper", ("one", "both"): "lower", ("mean", "mean"): "mean"}
     return words.get(tuple(seen), "all")
 
@@ -113,7 +130,9 @@ def find_smallest(name):
 
 def find_far_bound(name):
     for far in FAR_BOUNDS:
-        found = run_alone(name, [[2, 0.5], [0.5, 1]], [-1, -1], G=[[1, 1]], h=[1], lb=[-far, -far], ub=[far, far])
+        found = run_alone(
+            name, [[2, 0.5], [0.5, 1]], [-1, -1], G=[[1, 1]], h=[1], lb=[-far, -far], ub=[far, far]
+        )
         if give_verdict(found, [0.25, 0.75]) != "right":
             return far
     return math.inf
@@ -135,7 +154,11 @@ def find_conflict(name):
 def find_offset(name):
     far = 1e8
     found = run_alone(name, np.eye(2), [-far - 0.3] * 2, lb=[far] * 2, ub=[far + 1] * 2)
-    return None if isinstance(found, Exception) or not found.found else float(f"{np.ravel(found.x)[0] - far:.1g}")
+    return (
+        None
+        if isinstance(found, Exception) or not found.found
+        else float(f"{np.ravel(found.x)[0] - far:.1g}")
+    )
 
 
 def find_dependent(name):
@@ -156,16 +179,23 @@ SADDLE = np.diag([1, -1])
 BEHAVIOUR_PROBES = {
     "triangle": find_triangle,
     "repeated": lambda n: give_verdict(
-        run_alone(n, np.eye(2), [0, 0], A=[[0.3, 0.7], [0.3, 0.7]], b=[1, 1]), [0.3 / 0.58, 0.7 / 0.58]
+        run_alone(n, np.eye(2), [0, 0], A=[[0.3, 0.7], [0.3, 0.7]], b=[1, 1]),
+        [0.3 / 0.58, 0.7 / 0.58],
     ),
     "dependent": find_dependent,
-    "contradictory": lambda n: give_verdict(run_alone(n, np.eye(2), [0, 0], A=[[1, 1], [1, 1]], b=[1, 2])),
-    "singular": lambda n: give_verdict(run_alone(n, np.diag([1, 0]), [0, -1], lb=[-5, 0], ub=[5, 1]), [0, 1]),
+    "contradictory": lambda n: give_verdict(
+        run_alone(n, np.eye(2), [0, 0], A=[[1, 1], [1, 1]], b=[1, 2])
+    ),
+    "singular": lambda n: give_verdict(
+        run_alone(n, np.diag([1, 0]), [0, -1], lb=[-5, 0], ub=[5, 1]), [0, 1]
+    ),
     "convex_on_rows": lambda n: give_verdict(
         run_alone(n, SADDLE, [0, 0], A=[[0, 1]], b=[0.5], lb=[-9, -9], ub=[9, 9]), [0, 0.5]
     ),
     "saddle": lambda n: give_verdict(run_alone(n, SADDLE, [0, 0], lb=[-1, -1], ub=[1, 2]), [0, 2]),
-    "unbounded": lambda n: give_verdict(run_alone(n, np.diag([1, 0]), [0, -1], lb=[0, 0], ub=[np.inf, np.inf])),
+    "unbounded": lambda n: give_verdict(
+        run_alone(n, np.diag([1, 0]), [0, -1], lb=[0, 0], ub=[np.inf, np.inf])
+    ),
     "infeasible_x": find_infeasible_x,
     "linear_term": find_linear_term,
     "small_part": find_small_part,
@@ -219,14 +249,22 @@ def solve_with_scs(solver=None, **start):
     import scs
 
     P, q, A = draw_bounded_program()
-    data = {"P": sp.csc_matrix(np.triu(P)), "c": q, "A": sp.csc_matrix(np.vstack([A, -A])), "b": np.ones(40)}
+    data = {
+        "P": sp.csc_matrix(np.triu(P)),
+        "c": q,
+        "A": sp.csc_matrix(np.vstack([A, -A])),
+        "b": np.ones(40),
+    }
     solver = solver or scs.SCS(data, {"l": 40}, verbose=False, eps_abs=1e-8, eps_rel=0.0)
     return solver, solver.solve(**start)
 
 
 def scs_needs_x_y_and_s():
     solution = solve_with_scs()[1]
-    count = {k: solve_with_scs(**{n: solution[n] for n in k})[1]["info"]["iter"] for k in ("x", "xy", "xs", "xys")}
+    count = {
+        k: solve_with_scs(**{n: solution[n] for n in k})[1]["info"]["iter"]
+        for k in ("x", "xy", "xs", "xys")
+    }
     return count.pop("xys") == 0 and min(count.values()) > 0
 
 
@@ -240,7 +278,10 @@ def piqp_fails_with_unsorted_indices():
 
     P = sp.csc_matrix((np.array([1.0, 2.0, 2.0, 1.0]), np.array([1, 0, 1, 0]), np.array([0, 2, 4])))
     arrays = {"lb": np.full(2, -9.0), "ub": np.full(2, 9.0)}
-    found = [qpsolvers.solve_problem(qpsolvers.Problem(M, -np.ones(2), **arrays), "piqp") for M in (P, P.toarray())]
+    found = [
+        qpsolvers.solve_problem(qpsolvers.Problem(M, -np.ones(2), **arrays), "piqp")
+        for M in (P, P.toarray())
+    ]
     return not found[0].found and give_verdict(found[1], [1 / 3, 1 / 3]) == "right"
 
 
@@ -260,12 +301,16 @@ def proxqp_finds_a_program_infeasible():
     program |= {"lb": [-5, -5], "ub": [5, 5]}
     found = run_alone("proxqp", **program)
     weighted = run_alone("proxqp", **program, settings={"rho": 0.1, "eps_abs": 1e-9})
-    return "PRIMAL_INFEASIBLE" in str(found.extras["info"].status) and is_near(weighted.x, np.array([0, 1]))
+    return "PRIMAL_INFEASIBLE" in str(found.extras["info"].status) and is_near(
+        weighted.x, np.array([0, 1])
+    )
 
 
 def highs_returns_zeros():
     def solve(e, **rows):
-        return np.ravel(run_alone("highs", np.eye(2), [-e, -2 * e], lb=[0, 0], ub=[np.inf] * 2, **rows).x)
+        return np.ravel(
+            run_alone("highs", np.eye(2), [-e, -2 * e], lb=[0, 0], ub=[np.inf] * 2, **rows).x
+        )
 
     zeros = solve(1e-5, G=[[1, 1]], h=[np.inf])
     return not zeros.any() and is_near(solve(1024e-5), np.array([1024e-5, 2048e-5]))
@@ -288,7 +333,11 @@ def daqp_reads_a_slice_as_contiguous():
     whole[:2, :2] = [[2.0, 1.0], [1.0, 2.0]]
     arguments = -np.ones(2), np.zeros((0, 2)), bound, -bound, np.zeros(2, np.int32)
     found, right = (daqp.solve(P, *arguments) for P in (whole[:2, :2], whole[:2, :2].copy()))
-    return found[2] == right[2] == 1 and is_near(right[0], np.full(2, 1 / 3)) and not is_near(found[0], right[0])
+    return (
+        found[2] == right[2] == 1
+        and is_near(right[0], np.full(2, 1 / 3))
+        and not is_near(found[0], right[0])
+    )
 
 
 def qpoases_reads_columns_as_rows():
@@ -312,7 +361,9 @@ def pyqpmad_overwrites_columns():
     import qpsolvers
 
     P = np.asfortranarray([[2.0, 1.0], [1.0, 2.0]])
-    qpsolvers.solve_problem(qpsolvers.Problem(P, -np.ones(2), np.ones((1, 2)), np.ones(1)), "pyqpmad")
+    qpsolvers.solve_problem(
+        qpsolvers.Problem(P, -np.ones(2), np.ones((1, 2)), np.ones(1)), "pyqpmad"
+    )
     return not np.array_equal(P, [[2.0, 1.0], [1.0, 2.0]])
 
 
@@ -355,7 +406,10 @@ def main():
 
     packages = {b.name: b.modules[-1] for b in BACKENDS}
     for name in sys.argv[1:] or qpsolvers.available_solvers:
-        print(f"{name} {version(packages[name])}", {k: probe(name) for k, probe in BEHAVIOUR_PROBES.items()})
+        print(
+            f"{name} {version(packages[name])}",
+            {k: probe(name) for k, probe in BEHAVIOUR_PROBES.items()},
+        )
         sys.stdout.flush()
 
 

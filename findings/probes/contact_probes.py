@@ -26,7 +26,9 @@ TIME_LIMIT = 2.0  # s for a problem, for packages with a limit
 def make_problems():
     """Return (A, b, lower, upper) of each problem."""
     problems = []
-    for name in dict.fromkeys(n for key in ("default", "hard", "engine") for n in lv.suite.SETS[key]):
+    for name in dict.fromkeys(
+        n for key in ("default", "hard", "engine") for n in lv.suite.SETS[key]
+    ):
         problem = lv.suite.case(name).problem
         if problem.m > MAX_ROWS or not problem.is_symmetric:
             continue
@@ -35,7 +37,10 @@ def make_problems():
             impulse = lv.solve(cone, "newton", tol=1e-10, max_iter=500).impulse
             normals = impulse[problem.cones.normal_rows]
             problem = problem.boxed(np.maximum(normals, 1e-3 * np.abs(impulse).max()))
-        if problem.is_semidefinite and lv.solve(problem, tol=1e-9).status is not lv.Status.INFEASIBLE:
+        if (
+            problem.is_semidefinite
+            and lv.solve(problem, tol=1e-9).status is not lv.Status.INFEASIBLE
+        ):
             A = problem.dense()
             problems.append(((A + A.T) / 2, problem.b, problem.cones.lower, problem.cones.upper))
     return problems
@@ -62,7 +67,9 @@ def call_elastiqp(method, A, b, low, high):
 
     rows = np.vstack([np.eye(len(b))[np.isfinite(high)], -np.eye(len(b))[np.isfinite(low)]])
     sides = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
-    found = elastiqp.solve(np.asfortranarray(A), -b, np.asfortranarray(rows), sides, 1e6, method=method)
+    found = elastiqp.solve(
+        np.asfortranarray(A), -b, np.asfortranarray(rows), sides, 1e6, method=method
+    )
     return np.array(found.x), found.status == elastiqp.Status.Solved
 
 
@@ -73,7 +80,11 @@ def call_ipax(A, b, low, high):
         def bounds(self):
             return low, high
 
-    found = ipax.solve(Program(A, -b), np.clip(np.zeros(len(b)), low, high), options=ipax.Options(max_time=TIME_LIMIT))
+    found = ipax.solve(
+        Program(A, -b),
+        np.clip(np.zeros(len(b)), low, high),
+        options=ipax.Options(max_time=TIME_LIMIT),
+    )
     return np.array(found.x), found.status is ipax.Status.OPTIMAL
 
 
@@ -117,4 +128,8 @@ if __name__ == "__main__":
     print(f"{len(problems)} problems: solved, wrong, not solved with A times", *UNITS)
     for name in sys.argv[1:] or CALLS:
         with contextlib.suppress(ModuleNotFoundError):
-            print(f"{name:12}", *(count_answers(CALLS[name], problems, unit) for unit in UNITS), flush=True)
+            print(
+                f"{name:12}",
+                *(count_answers(CALLS[name], problems, unit) for unit in UNITS),
+                flush=True,
+            )

@@ -44,10 +44,16 @@ def step_drake(name, dt, n, velocity=(0.0, 0.0, 0.0), kick=(0.0, 0.0, 0.0)):
     plant, _ = AddMultibodyPlantSceneGraph(builder, dt)
     plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, name))
     friction = CoulombFriction(FRICTION, FRICTION)
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction
+    )
     body = plant.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(1.0, 0.2, 0.2, 0.2))
-    for k, corner in enumerate(np.array([(x, y, -0.08) for x in (-0.08, 0.08) for y in (-0.08, 0.08)])):
-        plant.RegisterCollisionGeometry(body, RigidTransform(corner), Sphere(0.02), f"foot {k}", friction)
+    for k, corner in enumerate(
+        np.array([(x, y, -0.08) for x in (-0.08, 0.08) for y in (-0.08, 0.08)])
+    ):
+        plant.RegisterCollisionGeometry(
+            body, RigidTransform(corner), Sphere(0.02), f"foot {k}", friction
+        )
     plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0.0, 0.0, 0.1]))
     plant.Finalize()
     simulator = Simulator(builder.Build())
@@ -59,7 +65,10 @@ def step_drake(name, dt, n, velocity=(0.0, 0.0, 0.0), kick=(0.0, 0.0, 0.0)):
     plant.SetVelocities(context, before)
     simulator.AdvanceTo(n * dt)
     results = plant.get_contact_results_output_port().Eval(context)
-    forces = [results.point_pair_contact_info(i).contact_force() for i in range(results.num_point_pair_contacts())]
+    forces = [
+        results.point_pair_contact_info(i).contact_force()
+        for i in range(results.num_point_pair_contacts())
+    ]
     depth = 0.1 - plant.EvalBodyPoseInWorld(context, body).translation()[2]
     return depth, before[3:], np.array(plant.GetVelocities(context))[3:], np.array(forces)
 
@@ -73,7 +82,9 @@ def step_drake(name, dt, n, velocity=(0.0, 0.0, 0.0), kick=(0.0, 0.0, 0.0)):
 )
 def drake_rests_deeper_with_sap():
     others = [
-        step_drake(name, dt, round(2.0 / dt))[0] for name in ("kLagged", "kSimilar", "kTamsi") for dt in (0.01, 0.001)
+        step_drake(name, dt, round(2.0 / dt))[0]
+        for name in ("kLagged", "kSimilar", "kTamsi")
+        for dt in (0.01, 0.001)
     ]
     long, short = step_drake("kSap", 0.01, 200)[0], step_drake("kSap", 0.001, 2000)[0]
     return max(others) < 1e-5 < 2e-5 < short < long / 8.0 and long < 1e-3
@@ -91,7 +102,9 @@ def drake_boxes_hop_with_sap():
     def compute_upward_velocity(name, dt):
         return step_drake(name, dt, round(0.3 / dt), kick=(2.0, 0.0, 0.0))[2][2]
 
-    hops = [compute_upward_velocity(name, dt) for name in ("kSap", "kSimilar") for dt in (0.01, 0.001)]
+    hops = [
+        compute_upward_velocity(name, dt) for name in ("kSap", "kSimilar") for dt in (0.01, 0.001)
+    ]
     others = [compute_upward_velocity(name, 0.01) for name in ("kLagged", "kTamsi")]
     return np.allclose(hops, 0.76, atol=0.04) and max(np.abs(others)) < 0.01
 
@@ -149,7 +162,9 @@ def drake_ignores_the_penetration_allowance():
     for allowance, stiffness in ((None, None), (0.1, None), (None, 1e4)):
         builder, plant, scene_graph = make_drake_plant()
         friction = CoulombFriction(FRICTION, FRICTION)
-        plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+        plant.RegisterCollisionGeometry(
+            plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction
+        )
         body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
         plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
         plant.SetDefaultFloatingBaseBodyPose(body, RigidTransform([0.0, 0.0, 0.1]))
@@ -175,7 +190,9 @@ def drake_clamps_feed_forward():
 
     builder, plant, _ = make_drake_plant(0.001)
     body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    joint = plant.AddJoint(PrismaticJoint("joint", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+    joint = plant.AddJoint(
+        PrismaticJoint("joint", plant.world_frame(), body.body_frame(), [1, 0, 0])
+    )
     plant.AddJointActuator("motor", joint, 2.0)
     _simulator, context = simulate_drake(builder, plant, 1.0, [10.0])
     return np.isclose(plant.GetVelocities(context)[0], 2.0, rtol=1e-6)
@@ -192,7 +209,9 @@ def drake_reactions_contain_limits():
 
     builder, plant, _ = make_drake_plant(0.001)
     body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
-    arm = plant.AddFrame(FixedOffsetFrame("arm", body.body_frame(), RigidTransform([-0.3, 0.0, 0.0])))
+    arm = plant.AddFrame(
+        FixedOffsetFrame("arm", body.body_frame(), RigidTransform([-0.3, 0.0, 0.0]))
+    )
     plant.AddJoint(RevoluteJoint("joint", plant.world_frame(), arm, [0, 1, 0], -0.001, 0.001))
     _simulator, context = simulate_drake(builder, plant, 1.0)
     (reaction,) = plant.get_reaction_forces_output_port().Eval(context)

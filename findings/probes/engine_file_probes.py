@@ -10,7 +10,16 @@ import numpy as np
 from engine_drake_probes import DRAKE
 from engine_facts import fact
 from engine_newton_probes import NEWTON, NEWTON_MUJOCO
-from engine_probes import GENESIS, MUJOCO, PINOCCHIO, PYBULLET, SAPIEN, make_genesis, make_mujoco, make_pybullet
+from engine_probes import (
+    GENESIS,
+    MUJOCO,
+    PINOCCHIO,
+    PYBULLET,
+    SAPIEN,
+    make_genesis,
+    make_mujoco,
+    make_pybullet,
+)
 
 # -- one URDF in several engines -----------------------------------------------------------------------
 
@@ -81,7 +90,11 @@ def mujoco_reads_effort_and_friction():
     return np.allclose(model.jnt_actfrcrange, [[-5, 5]]) and model.dof_frictionloss[0] == 1.0
 
 
-@fact(*DRAKE, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint are enforced.")
+@fact(
+    *DRAKE,
+    "URDF: limits of a continuous joint",
+    "`lower` and `upper` of a continuous joint are enforced.",
+)
 def drake_limits_continuous_joints():
     plant = make_drake(write_urdf())
     return plant.GetPositionLowerLimits()[0] == -1.0 and plant.GetPositionUpperLimits()[0] == 1.0
@@ -96,10 +109,18 @@ def drake_drops_mimic_with_tamsi():
     from pydrake.all import DiscreteContactApproximation as Approximation
 
     kinds = Approximation.kSap, Approximation.kLagged, Approximation.kTamsi
-    return [make_drake(write_urdf("revolute", mimic=True), k).num_constraints() for k in kinds] == [1, 1, 0]
+    return [make_drake(write_urdf("revolute", mimic=True), k).num_constraints() for k in kinds] == [
+        1,
+        1,
+        0,
+    ]
 
 
-@fact(*NEWTON, "URDF: limits of a continuous joint", "`lower` and `upper` of a continuous joint become limits.")
+@fact(
+    *NEWTON,
+    "URDF: limits of a continuous joint",
+    "`lower` and `upper` of a continuous joint become limits.",
+)
 def newton_limits_continuous_joints():
     import newton
 
@@ -123,7 +144,10 @@ def pinocchio_drops_mimic():
     import pinocchio
 
     urdf = write_urdf("revolute", mimic=True)
-    return pinocchio.buildModelFromXML(urdf).nv == 2 and pinocchio.buildModelFromXML(urdf, mimic=True).nv == 1
+    return (
+        pinocchio.buildModelFromXML(urdf).nv == 2
+        and pinocchio.buildModelFromXML(urdf, mimic=True).nv == 1
+    )
 
 
 @fact(
@@ -146,7 +170,11 @@ def pinocchio_reads_part_of_mjcf():
         path.write_text(xml)
         model = pinocchio.buildModelFromMJCF(str(path))
     limits = model.lowerPositionLimit[0], model.upperPositionLimit[0]
-    return model.nv == 1 and np.allclose(limits, np.deg2rad([-1, 2])) and model.gravity.linear[2] == -9.81
+    return (
+        model.nv == 1
+        and np.allclose(limits, np.deg2rad([-1, 2]))
+        and model.gravity.linear[2] == -9.81
+    )
 
 
 def load_pybullet(bullet, urdf, **options):
@@ -197,12 +225,17 @@ def drake_drops_armature_without_actuator():
     inertia = []
     for extra in ("", '<actuator><motor joint="h"/></actuator>'):
         plant = MultibodyPlant(0.01)
-        text = PENDULUM_MJCF.format(joint='armature="0.5" damping="0.7" range="-1 2" limited="true"', extra=extra)
+        text = PENDULUM_MJCF.format(
+            joint='armature="0.5" damping="0.7" range="-1 2" limited="true"', extra=extra
+        )
         Parser(plant).AddModelsFromString(text, "xml")
         plant.Finalize()
         context = plant.CreateDefaultContext()
         inertia.append(float(plant.CalcMassMatrix(context)[0, 0]))
-        is_read = plant.gravity_field().gravity_vector()[2] == -3.0 and plant.GetPositionLowerLimits()[0] == -1.0
+        is_read = (
+            plant.gravity_field().gravity_vector()[2] == -3.0
+            and plant.GetPositionLowerLimits()[0] == -1.0
+        )
     return is_read and np.isclose(inertia[1] - inertia[0], 0.5)
 
 
@@ -219,7 +252,9 @@ def genesis_adds_armature():
         path = Path(folder, "pendulum.xml")
         path.write_text(PENDULUM_MJCF.format(joint="", extra=""))
         for options in ({}, {"default_armature": 0.0}):
-            scene = make_genesis((lambda morphs, options=options: morphs.MJCF(file=str(path), **options), {}))
+            scene = make_genesis(
+                (lambda morphs, options=options: morphs.MJCF(file=str(path), **options), {})
+            )
             inertia.append(float(scene.entities[0].get_dofs_armature()[0]))
     return np.allclose(inertia, [0.1, 0.0])
 
@@ -238,7 +273,12 @@ def sapien_drops_mimic_effort_and_friction():
         loader = sapien.Scene([sapien.physx.PhysxCpuSystem()]).create_urdf_loader()
         loader.fix_root_link = True
         first = (robot := loader.load(str(path))).get_active_joints()[0]
-    return robot.dof == 2 and first.force_limit > 1e30 and np.isclose(first.friction, 0.05) and first.damping == 2.0
+    return (
+        robot.dof == 2
+        and first.force_limit > 1e30
+        and np.isclose(first.friction, 0.05)
+        and first.damping == 2.0
+    )
 
 
 def make_kamino(urdf, has_drive=False):
@@ -253,7 +293,9 @@ def make_kamino(urdf, has_drive=False):
             newton.solvers.SolverKamino.register_custom_attributes(item)
         world.add_urdf(urdf)
         if not has_drive:
-            world.joint_target_mode = [int(newton.JointTargetMode.NONE)] * len(world.joint_target_mode)
+            world.joint_target_mode = [int(newton.JointTargetMode.NONE)] * len(
+                world.joint_target_mode
+            )
         builder.add_world(world)
         model = builder.finalize(device="cpu")
         return model, newton.solvers.SolverKamino(model)
@@ -294,7 +336,11 @@ def kamino_drops_mimic():
     # The rotations about y of both links; the pendulums move, and the second angle is not 2 q + 0.1.
     quaternions = before.body_q.numpy()[-2:, 3:]
     first, second = 2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3])
-    return model.joint_dof_count == 2 and first > 0.01 and abs(second - first - (2.0 * first + 0.1)) > 0.05
+    return (
+        model.joint_dof_count == 2
+        and first > 0.01
+        and abs(second - first - (2.0 * first + 0.1)) > 0.05
+    )
 
 
 @fact(
@@ -317,7 +363,9 @@ def newton_drops_static_friction():
     box = UsdGeom.Cube.Define(stage, "/box").GetPrim()
     for schema in (UsdPhysics.RigidBodyAPI, UsdPhysics.CollisionAPI, UsdPhysics.MassAPI):
         schema.Apply(box)
-    UsdShade.MaterialBindingAPI.Apply(box).Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+    UsdShade.MaterialBindingAPI.Apply(box).Bind(
+        material, UsdShade.Tokens.weakerThanDescendants, "physics"
+    )
     builder = newton.ModelBuilder()
     with contextlib.redirect_stdout(io.StringIO()):
         builder.add_usd(stage)
@@ -338,13 +386,19 @@ def newton_drops_limit_stiffness_in_mjcf():
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     builder.add_urdf(write_urdf("revolute"))
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.redirect_stdout(io.StringIO()),
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")  # newton 1.8 warns of newer versions of MuJoCo.
         path = str(Path(folder, "model.xml"))
         solver = newton.solvers.SolverMuJoCo(builder.finalize(device="cpu"), save_to_mjcf=path)
         model = mujoco.MjModel.from_xml_path(path)
     used = solver.mjw_model.jnt_solref.numpy().reshape(-1, 2)[0]
-    return np.allclose(model.jnt_solref[0], [0.02, 1.0]) and not np.allclose(used, [0.02, 1.0], rtol=0.1)
+    return np.allclose(model.jnt_solref[0], [0.02, 1.0]) and not np.allclose(
+        used, [0.02, 1.0], rtol=0.1
+    )
 
 
 @fact(

@@ -12,7 +12,9 @@ NEWTON_MUJOCO = "newton", "newton mujoco_warp", "1.8.0"
 DT = 0.005  # s
 
 
-def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), height=0.1, margin=0.0, **options):
+def run_newton(
+    name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), height=0.1, margin=0.0, **options
+):
     """Step a box of 1 kg on a plane.
 
     Returns
@@ -39,7 +41,9 @@ def run_newton(name, n=60, gravity=(0.0, 0.0, -9.81), friction=(0.5, 0.5), heigh
         builder.add_world(world)
         builder.color()
         model = builder.finalize(device="cpu")
-        model.gravity.assign(np.tile(np.array(gravity, np.float32), (len(model.gravity.numpy()), 1)))
+        model.gravity.assign(
+            np.tile(np.array(gravity, np.float32), (len(model.gravity.numpy()), 1))
+        )
         solver = solver_class(model, **options)
         before, after, control = model.state(), model.state(), model.control()
         pipeline = newton.CollisionPipeline(model)
@@ -82,7 +86,11 @@ def kamino_has_reactions_in_newtons():
     solver = run_newton("SolverKamino")[0]
     n = int(solver._contacts_kamino.data.model_active_contacts.numpy()[0])
     force = solver._contacts_kamino.data.reaction.numpy()[:n].sum(axis=0)
-    impulse = solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[: 3 * n].reshape(n, 3).sum(axis=0)
+    impulse = (
+        solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[: 3 * n]
+        .reshape(n, 3)
+        .sum(axis=0)
+    )
     return np.allclose(force[2], 9.81, rtol=1e-3) and np.allclose(impulse[2], 9.81 * DT, rtol=1e-3)
 
 
@@ -125,7 +133,9 @@ def newton_accelerations_contain_contacts():
 def newton_drops_margins_in_mujoco():
     rows = []
     for is_mujoco in (True, False):
-        solver = run_newton("SolverMuJoCo", 1, height=0.105, margin=0.01, use_mujoco_contacts=is_mujoco)[0]
+        solver = run_newton(
+            "SolverMuJoCo", 1, height=0.105, margin=0.01, use_mujoco_contacts=is_mujoco
+        )[0]
         rows.append(int(solver.mjw_data.nefc.numpy()[0]))
     return rows == [0, 16]
 
@@ -205,5 +215,7 @@ def newton_ignores_gravity_of_mjcf():
     builder = newton.ModelBuilder()
     with contextlib.redirect_stdout(io.StringIO()):
         body = '<body><joint type="slide"/><geom size=".1"/></body>'
-        builder.add_mjcf(f'<mujoco><option gravity="0 0 -3"/><worldbody>{body}</worldbody></mujoco>')
+        builder.add_mjcf(
+            f'<mujoco><option gravity="0 0 -3"/><worldbody>{body}</worldbody></mujoco>'
+        )
     return np.allclose(builder.finalize(device="cpu").gravity.numpy()[0], [0.0, 0.0, -9.81])

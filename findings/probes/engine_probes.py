@@ -157,7 +157,10 @@ def make_sheet(elastic, solver, iterations):
     "`from_mujoco` rejects such a step and names the flex and the solver.",
 )
 def bending_stiffness_is_stored_with_newton_only():
-    return [make_sheet("bend", s, 300).efm_K_val.size > 0 for s in ("Newton", "CG")] == [True, False]
+    return [make_sheet("bend", s, 300).efm_K_val.size > 0 for s in ("Newton", "CG")] == [
+        True,
+        False,
+    ]
 
 
 @fact(
@@ -184,7 +187,10 @@ def tips_have_tilted_repeated_contacts():
 
     angle = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     ring = np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), 0.0 * angle], axis=1)
-    up, down = (" ".join(f"{x:.6f}" for x in np.vstack([ring, [[0.0, 0.0, tip]]]).ravel()) for tip in (0.1, -0.1))
+    up, down = (
+        " ".join(f"{x:.6f}" for x in np.vstack([ring, [[0.0, 0.0, tip]]]).ravel())
+        for tip in (0.1, -0.1)
+    )
     found = []
     for gap in (0.001, 0.0):
         model, data = make_mujoco(
@@ -223,7 +229,9 @@ def rolling_friction_is_viscous():
         step_mujoco(model, data, 100)
         before = data.qvel[0]
         step_mujoco(model, data, 100)
-        moment = 1.4 * 0.1 * (before - data.qvel[0]) / 0.2  # Of a solid sphere of 1 kg and 0.1 m, about the contact.
+        moment = (
+            1.4 * 0.1 * (before - data.qvel[0]) / 0.2
+        )  # Of a solid sphere of 1 kg and 0.1 m, about the contact.
         ratios.append(moment / (model.geom_friction[0, 2] * 9.81))
     return np.allclose(ratios, [0.05, 0.113], rtol=0.1)
 
@@ -343,11 +351,17 @@ def mjx_get_data_leaves_arrays_unwritten():
 )
 def mjx_ignores_noslip():
     gravity = 'cone="elliptic" gravity="3 0 -9.81"'
-    speed = [float(run_mjx(f'{gravity} noslip_iterations="{n}">', n=100)[1].qvel[0]) for n in (0, 20)]
+    speed = [
+        float(run_mjx(f'{gravity} noslip_iterations="{n}">', n=100)[1].qvel[0]) for n in (0, 20)
+    ]
     return speed[0] == speed[1] > 1e-4
 
 
-@fact(*MJX, '`integrator="discrete"`', "`put_model` accepts it, and the first step raises NotImplementedError.")
+@fact(
+    *MJX,
+    '`integrator="discrete"`',
+    "`put_model` accepts it, and the first step raises NotImplementedError.",
+)
 def mjx_has_no_discrete_integrator():
     try:
         run_mjx('integrator="discrete">', n=1)
@@ -364,7 +378,10 @@ def mjx_has_no_discrete_integrator():
 )
 def mjx_has_no_forces_with_nan():
     data = run_mjx(velocity=np.nan)[1]
-    return bool(np.isnan(data.qacc).any()) and not np.asarray(getattr(data, IMPLEMENTATION).efc_force).any()
+    return (
+        bool(np.isnan(data.qacc).any())
+        and not np.asarray(getattr(data, IMPLEMENTATION).efc_force).any()
+    )
 
 
 @fact(
@@ -445,7 +462,10 @@ def pybullet_multiplies_friction():
             bullet.createCollisionShape(bullet.GEOM_PLANE),
             bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1),
         )
-        bodies = bullet.createMultiBody(0, shapes[0]), bullet.createMultiBody(1, shapes[1], basePosition=[0, 0, 0.1])
+        bodies = (
+            bullet.createMultiBody(0, shapes[0]),
+            bullet.createMultiBody(1, shapes[1], basePosition=[0, 0, 0.1]),
+        )
         for body, friction in zip(bodies, pair, strict=True):
             bullet.changeDynamics(body, -1, lateralFriction=friction)
         for _ in range(60):
@@ -466,9 +486,14 @@ def pybullet_constraint_forces_have_two_signs():
     for kind in ("JOINT_POINT2POINT", "JOINT_FIXED"):
         bullet = make_pybullet()
         shape = bullet.createCollisionShape(bullet.GEOM_SPHERE, radius=0.1)
-        upper, lower = (bullet.createMultiBody(mass, shape, basePosition=[0, 0, z]) for mass, z in ((0, 1.0), (1, 0.5)))
+        upper, lower = (
+            bullet.createMultiBody(mass, shape, basePosition=[0, 0, z])
+            for mass, z in ((0, 1.0), (1, 0.5))
+        )
         ends = [0, 0, -0.25], [0, 0, 0.25]
-        constraint = bullet.createConstraint(upper, -1, lower, -1, getattr(bullet, kind), [0, 0, 0], *ends)
+        constraint = bullet.createConstraint(
+            upper, -1, lower, -1, getattr(bullet, kind), [0, 0, 0], *ends
+        )
         for _ in range(240):
             bullet.stepSimulation()
         forces.append(bullet.getConstraintState(constraint)[2])
@@ -502,7 +527,11 @@ def sapien_impulses_have_no_friction():
         scene.step()
         points = [p for contact in scene.physx_system.get_contacts() for p in contact.points]
         found.append(sum((np.array(p.impulse) for p in points), np.zeros(3)))
-    return abs(found[99][0]) < 1e-6 < found[99][2] and body.is_sleeping and np.array_equal(found[298], found[299])
+    return (
+        abs(found[99][0]) < 1e-6 < found[99][2]
+        and body.is_sleeping
+        and np.array_equal(found[298], found[299])
+    )
 
 
 # -- MuJoCo Warp ---------------------------------------------------------------------------------------
@@ -643,7 +672,9 @@ def solve_pinocchio(kind, delassus, **options):
     contact.setFriction(0.5)
     models.append(pinocchio.ConstraintModel(contact))
     datas.append(pinocchio.ConstraintData(contact.createData()))
-    settings, result = (getattr(pinocchio, f"{kind}Solver{word}")() for word in ("Settings", "Result"))
+    settings, result = (
+        getattr(pinocchio, f"{kind}Solver{word}")() for word in ("Settings", "Result")
+    )
     for name, value in options.items():
         setattr(settings, name, value)
     matrix = pinocchio.DelassusOperatorDense(np.asfortranarray(delassus))
@@ -659,7 +690,11 @@ def solve_pinocchio(kind, delassus, **options):
     'Compare impulses of PGS with the law "coulomb" only.',
 )
 def pinocchio_pgs_ignores_solve_ncp():
-    found = [solve_pinocchio(k, np.eye(3), solve_ncp=ncp)[0][2] for k in ("ADMM", "PGS") for ncp in (True, False)]
+    found = [
+        solve_pinocchio(k, np.eye(3), solve_ncp=ncp)[0][2]
+        for k in ("ADMM", "PGS")
+        for ncp in (True, False)
+    ]
     return np.allclose(found, [1.0, 1.6, 1.0, 1.0], atol=1e-4)
 
 
@@ -692,14 +727,18 @@ def pinocchio_joint_friction_has_its_own_time_step():
     impulses = []
     for dt in (None, 0.01):
         models, datas = pinocchio.StdVec_ConstraintModel(), pinocchio.StdVec_ConstraintData()
-        friction = pinocchio.JointFrictionConstraintModel(model, [joint], np.array([-2.0]), np.array([2.0]))
+        friction = pinocchio.JointFrictionConstraintModel(
+            model, [joint], np.array([-2.0]), np.array([2.0])
+        )
         if dt is not None:
             friction.setTimeStep(dt)
         models.append(pinocchio.ConstraintModel(friction))
         datas.append(pinocchio.ConstraintData(friction.createData()))
         settings, result = pinocchio.PGSSolverSettings(), pinocchio.PGSSolverResult()
         matrix = pinocchio.DelassusOperatorDense(np.asfortranarray(np.eye(1)))
-        pinocchio.PGSConstraintSolver(1).solve(matrix, np.array([-100.0]), models, datas, settings, result)
+        pinocchio.PGSConstraintSolver(1).solve(
+            matrix, np.array([-100.0]), models, datas, settings, result
+        )
         impulses.append(result.retrieveConstraintImpulses()[0])
     return np.allclose(impulses, [2.0, 0.02])
 
@@ -736,7 +775,9 @@ def genesis_uses_the_larger_friction():
     def box(morphs):
         return morphs.Box(size=(0.2,) * 3, pos=(0, 0, 0.1))
 
-    scene = make_genesis((floor, {"friction": 0.2}), (box, {"friction": 0.8, "rho": 125}), gravity=(5.0, 0.0, -10.0))
+    scene = make_genesis(
+        (floor, {"friction": 0.2}), (box, {"friction": 0.8, "rho": 125}), gravity=(5.0, 0.0, -10.0)
+    )
     for _ in range(80):
         scene.step()
     plane, body = scene.entities
@@ -761,7 +802,10 @@ def box2d_impulses_are_of_the_last_substep():
     lib, ffi = _box2d.lib, _box2d.ffi
 
     def add_box(world, kind, y, half_width, half_height):
-        body, shape = ffi.new("b2BodyDef*", lib.b2DefaultBodyDef()), ffi.new("b2ShapeDef*", lib.b2DefaultShapeDef())
+        body, shape = (
+            ffi.new("b2BodyDef*", lib.b2DefaultBodyDef()),
+            ffi.new("b2ShapeDef*", lib.b2DefaultShapeDef()),
+        )
         body.type = kind
         body.position.y = y
         shape.density = 1.0
@@ -807,5 +851,9 @@ def siconos_error_changes_with_the_unit_of_mass():
         reaction = np.array([1.1 * mass, 0.0, 0.0])
         options = numerics.SolverOptions(numerics.SICONOS_FRICTION_3D_NSGS)
         velocity = matrix @ reaction + q
-        errors.append(numerics.fc3d_compute_error(problem, reaction, velocity, 1e-8, options, np.linalg.norm(q))[1])
+        errors.append(
+            numerics.fc3d_compute_error(
+                problem, reaction, velocity, 1e-8, options, np.linalg.norm(q)
+            )[1]
+        )
     return np.allclose(errors, [1.1e-3, 0.1 / 1.1, 0.1 / 1100.0], rtol=1e-6)

@@ -50,15 +50,21 @@ def step_scene(with_arm, **options):
     if not getattr(gs, "_initialized", False):
         gs.init(backend=gs.cpu, precision="32", logging_level="error")
     names = {"friction_cone": gs.friction_cone, "contact_resolution": gs.contact_resolution}
-    options = {key: getattr(names[key], value) if key in names else value for key, value in options.items()}
+    options = {
+        key: getattr(names[key], value) if key in names else value for key, value in options.items()
+    }
     scene = gs.Scene(
-        show_viewer=False, sim_options=gs.options.SimOptions(dt=DT), rigid_options=gs.options.RigidOptions(**options)
+        show_viewer=False,
+        sim_options=gs.options.SimOptions(dt=DT),
+        rigid_options=gs.options.RigidOptions(**options),
     )
     scene.add_entity(gs.morphs.Plane())
     if with_arm:
         scene.add_entity(gs.morphs.MJCF(file="xml/franka_emika_panda/panda.xml"))
     for k in range(4 if with_arm else 3):
-        scene.add_entity(gs.morphs.Box(size=(0.1, 0.1, 0.1), pos=(0.45 + 0.02 * k, 0.0, 0.05 + 0.1 * k)))
+        scene.add_entity(
+            gs.morphs.Box(size=(0.1, 0.1, 0.1), pos=(0.45 + 0.02 * k, 0.0, 0.05 + 0.1 * k))
+        )
     scene.build(n_envs=ENVIRONMENTS)
     solver = scene.sim.rigid_solver
     velocity = np.zeros((ENVIRONMENTS, solver.n_dofs), np.float32)
@@ -73,7 +79,9 @@ def step_scene(with_arm, **options):
 def main(out):
     from genesis.utils.misc import qd_to_numpy
 
-    arrays = {"versions": np.array([f"{name} {version(name)}" for name in ("genesis-world", "torch")])}
+    arrays = {
+        "versions": np.array([f"{name} {version(name)}" for name in ("genesis-world", "torch")])
+    }
     convex = {"contact_resolution": "convex", "enable_torsional_friction": True}
     for name, with_arm, options in (
         ("arm", True, {"friction_cone": "elliptic"}),
@@ -84,9 +92,13 @@ def main(out):
         rows = int(qd_to_numpy(read(scene, f"{STATE}.n_constraints")).max())
         for path in PATHS:
             values = np.array(qd_to_numpy(read(scene, path)))
-            arrays[f"{name}/{path}"] = values[: rows + 2] if path.rsplit(".", 1)[1] in ROWS else values
+            arrays[f"{name}/{path}"] = (
+                values[: rows + 2] if path.rsplit(".", 1)[1] in ROWS else values
+            )
         for key in CONFIG:
-            arrays[f"{name}/{SOLVER}.rigid_config.{key}"] = np.array(getattr(scene.sim.rigid_solver.rigid_config, key))
+            arrays[f"{name}/{SOLVER}.rigid_config.{key}"] = np.array(
+                getattr(scene.sim.rigid_solver.rigid_config, key)
+            )
         arrays[f"{name}/{SOLVER}.substep_dt"] = np.array(scene.sim.rigid_solver.substep_dt)
     np.savez_compressed(out, **arrays)
 

@@ -60,9 +60,13 @@ PATHS = (
     *(f"_contacts_kamino.data.{name}" for name in CONTACTS),
     "status",
 )
-DENSE_JACOBIAN = ("_solver_kamino._jacobians.data.J_cts_data", "_solver_kamino._jacobians.data.J_cts_offsets")
+DENSE_JACOBIAN = (
+    "_solver_kamino._jacobians.data.J_cts_data",
+    "_solver_kamino._jacobians.data.J_cts_offsets",
+)
 SPARSE_JACOBIAN = tuple(
-    f"_solver_kamino._jacobians._J_cts.bsm.{name}" for name in ("num_nzb", "nzb_start", "nzb_coords", "nzb_values")
+    f"_solver_kamino._jacobians._J_cts.bsm.{name}"
+    for name in ("num_nzb", "nzb_start", "nzb_coords", "nzb_values")
 )
 LABELS = ("_solver_kamino._model.joints.label", "_solver_kamino._model.bodies.label")
 
@@ -125,7 +129,8 @@ def main(out):
         for i, m in enumerate(rows):  # The rest of a world's part of D is of earlier steps.
             start = arrays[f"{model}/_solver_kamino.problem_fd.data.mio"][i]
             arrays[f"{model}/_solver_kamino.problem_fd.data.D"][start + int(m) ** 2 :][
-                : int(arrays[f"{model}/_solver_kamino.problem_fd.data.maxdim"][i]) ** 2 - int(m) ** 2
+                : int(arrays[f"{model}/_solver_kamino.problem_fd.data.maxdim"][i]) ** 2
+                - int(m) ** 2
             ] = 0.0
     np.savez_compressed(out, **arrays)
 

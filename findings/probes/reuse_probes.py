@@ -9,7 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 from backend_probes import be_quiet, call_qpsolvers, draw_bounded_program
 
-SPARSE_SIZE = 100_000  # Unknowns with which the set-up of Clarabel takes about as long as its solve.
+SPARSE_SIZE = (
+    100_000  # Unknowns with which the set-up of Clarabel takes about as long as its solve.
+)
 
 
 class OsqpSession:
@@ -22,7 +24,14 @@ class OsqpSession:
         one = np.ones(len(A))
         settings = {} if limit is None else {"time_limit": limit}
         self.solver.setup(
-            sp.csc_matrix(sp.triu(P)), q, sp.csc_matrix(A), -one, one, verbose=False, warm_starting=False, **settings
+            sp.csc_matrix(sp.triu(P)),
+            q,
+            sp.csc_matrix(A),
+            -one,
+            one,
+            verbose=False,
+            warm_starting=False,
+            **settings,
         )
 
     def solve(self):
@@ -58,7 +67,9 @@ class ClarabelSession:
         settings.time_limit = math.inf if limit is None else limit
         rows = sp.csc_matrix(np.vstack([A, -A]))
         cones = [clarabel.NonnegativeConeT(2 * len(A))]
-        self.solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(P)), q, rows, np.ones(2 * len(A)), cones, settings)
+        self.solver = clarabel.DefaultSolver(
+            sp.csc_matrix(sp.triu(P)), q, rows, np.ones(2 * len(A)), cones, settings
+        )
 
     def solve(self):
         found = self.solver.solve()
@@ -119,7 +130,11 @@ class HighsSession:
         rows = sp.csc_matrix(A)
         one = np.ones(len(A))
         model.hessian_.dim_ = len(q)
-        model.hessian_.start_, model.hessian_.index_, model.hessian_.value_ = lower.indptr, lower.indices, lower.data
+        model.hessian_.start_, model.hessian_.index_, model.hessian_.value_ = (
+            lower.indptr,
+            lower.indices,
+            lower.data,
+        )
         lp = model.lp_
         lp.num_col_ = len(q)
         lp.num_row_ = len(A)
@@ -129,7 +144,11 @@ class HighsSession:
         lp.row_lower_ = -one
         lp.row_upper_ = one
         lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
-        lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
+        lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = (
+            rows.indptr,
+            rows.indices,
+            rows.data,
+        )
         self.solver.passModel(model)
 
     def solve(self):
@@ -181,7 +200,9 @@ def find_time_limit(name):
     times.append(time.perf_counter())
     setup, solve = np.diff(times)
     limit = min(solve + setup / 4.0, 2.0 * solve)
-    is_solved = any(SESSIONS[name](*program, limit=limit).solve()[0] for _ in range(3))  # A busy machine delays one.
+    is_solved = any(
+        SESSIONS[name](*program, limit=limit).solve()[0] for _ in range(3)
+    )  # A busy machine delays one.
     return "without set-up" if is_solved else "with set-up"
 
 

@@ -22,7 +22,9 @@ def test_backend_called_once_behaves_as_recorded(name):
     behaviour = OBSERVED[name].behaviour
     found = {field: probe(name) for field, probe in BEHAVIOUR_PROBES.items()}
     recorded = {field: getattr(behaviour, field) for field in BEHAVIOUR_PROBES}
-    if name == "scs":  # Its iterates follow the rounding of the BLAS: 0.7 and 0.8 were seen with two builds.
+    if (
+        name == "scs"
+    ):  # Its iterates follow the rounding of the BLAS: 0.7 and 0.8 were seen with two builds.
         assert abs(found.pop("small_part") - recorded.pop("small_part")) < 0.15
     assert found == recorded
 
@@ -43,4 +45,6 @@ def test_backend_with_a_note_behaves_as_the_note_states(name, key):
 
 
 def test_probes_of_notes_cover_every_note():
-    assert set(NOTE_PROBES) == {(b.name, key) for b in OBSERVED.values() for key in b.behaviour.notes}
+    assert set(NOTE_PROBES) == {
+        (b.name, key) for b in OBSERVED.values() for key in b.behaviour.notes
+    }

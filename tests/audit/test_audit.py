@@ -40,13 +40,17 @@ def own_errors(path, world, steps, seed=0, spread=0.1):
     return out
 
 
-@pytest.mark.parametrize("options", [EARLY, f'{EARLY} cone="elliptic"', EARLY + ' jacobian="sparse"'])
+@pytest.mark.parametrize(
+    "options", [EARLY, f'{EARLY} cone="elliptic"', EARLY + ' jacobian="sparse"']
+)
 def test_audit_of_two_worlds_equals_the_judge_on_each_step(boxes, options):
     path = boxes(options)
     found = audit(path, worlds=2, steps=30, workers=1)
     for world in range(2):
         want = own_errors(path, world, 30)
-        np.testing.assert_allclose(found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12
+        )
         pushes = [abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0 for r in want]
         np.testing.assert_allclose(found.numbers[1, world], pushes, rtol=1e-6, atol=1e-12)
         assert found.is_unconverged[world].tolist() == [
@@ -68,12 +72,16 @@ def test_audit_worst_states_give_the_same_impulses_in_mujoco(boxes, tmp_path):
     assert states["world"].tolist() == np.argsort(-speeds.max(axis=1)).tolist()
     for i, (world, step) in enumerate(zip(states["world"], states["step"], strict=True)):
         stored = lv.io.read(tmp_path / "out" / "worst" / f"worst_{i + 1}.npz")
-        assert lv.residual(stored.problem, stored.impulse).velocity == pytest.approx(speeds[world].max())
+        assert lv.residual(stored.problem, stored.impulse).velocity == pytest.approx(
+            speeds[world].max()
+        )
         data = mj.MjData(made)
         for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
             getattr(data, name)[:] = states[name][i]
         mj.mj_forward(made, data)
-        np.testing.assert_allclose(lv.io.mujoco.impulse(made, data), stored.impulse, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            lv.io.mujoco.impulse(made, data), stored.impulse, rtol=1e-9, atol=1e-12
+        )
         assert speeds[world].argmax() == step
 
 
@@ -87,7 +95,10 @@ def make_frames(change):
         for step in range(runs.steps):
             mj.mj_forward(model, data)
             arrays = {name: np.array(getattr(data, name))[None] for name in names}
-            arrays |= {"efc_J": data.efc_J.reshape(1, -1, model.nv), "M": whole_mass(model, data)[None]}
+            arrays |= {
+                "efc_J": data.efc_J.reshape(1, -1, model.nv),
+                "M": whole_mass(model, data)[None],
+            }
             arrays = change(arrays, step)
             state = {"qpos": arrays.pop("qpos")}
             n = len(state["qpos"])
@@ -103,12 +114,18 @@ def test_audit_of_float32_separates_rounding_from_an_early_stop(boxes, monkeypat
 
     def change(arrays, step):
         arrays["efc_force"] *= 0.99 if step in planted else 1.0
-        return {name: x.astype(np.float32) for name, x in arrays.items() if name not in ("qacc", "qfrc_smooth")}
+        return {
+            name: x.astype(np.float32)
+            for name, x in arrays.items()
+            if name not in ("qacc", "qfrc_smooth")
+        }
 
     monkeypatch.setattr(module, "iterate_frames", make_frames(change))
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
     assert set(np.flatnonzero(found.is_unconverged[0])) == planted
-    assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
+    assert (found.numbers[0, 0] > 1e-9).sum() > len(
+        planted
+    )  # rounding leaves errors that float64 would not
 
 
 def test_audit_of_a_world_that_diverges_judges_the_other_worlds(boxes, monkeypatch):
@@ -116,13 +133,19 @@ def test_audit_of_a_world_that_diverges_judges_the_other_worlds(boxes, monkeypat
 
     def change(arrays, step):
         bad = np.nan if step >= 4 else 1.0
-        return {name: np.concatenate([x, bad * x]).astype(np.float32) for name, x in arrays.items() if name != "qacc"}
+        return {
+            name: np.concatenate([x, bad * x]).astype(np.float32)
+            for name, x in arrays.items()
+            if name != "qacc"
+        }
 
     monkeypatch.setattr(module, "iterate_frames", make_frames(change))
     found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
     assert (found.n_judged, found.n_unjudged, found.n_diverged) == (14, 6, 1)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
-    assert "1 world diverged, the first at step 4; " in words_of(found) and "; 6 steps not judged." in words_of(found)
+    assert "1 world diverged, the first at step 4; " in words_of(
+        found
+    ) and "; 6 steps not judged." in words_of(found)
 
 
 def test_audit_of_a_world_that_ends_in_a_mujoco_error_judges_only_steps_before(boxes, monkeypatch):
@@ -135,7 +158,9 @@ def test_audit_of_a_world_that_ends_in_a_mujoco_error_judges_only_steps_before(b
 
     monkeypatch.setattr(mj, "mj_step", dies)
     found = audit(boxes(), worlds=1, steps=12, workers=1)
-    assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+    assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [
+        k >= 8 for k in range(12)
+    ]
     assert (found.n_judged, found.n_unjudged, found.n_diverged) == (8, 4, 1)
     assert "1 world diverged, the first at step 8; no step is wrong" in words_of(found)
     assert "4 steps not judged" in words_of(found)
@@ -151,16 +176,28 @@ RUNAWAY = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("threshold", [1e-6, 1e3])  # What is close enough to the user need not be exact.
+@pytest.mark.parametrize(
+    "threshold", [1e-6, 1e3]
+)  # What is close enough to the user need not be exact.
 @pytest.mark.parametrize("options", ["", 'solver="PGS" iterations="1"'])
-def test_audit_of_a_divergence_after_exact_solves_blames_the_model(tmp_path, monkeypatch, options, threshold):
+def test_audit_of_a_divergence_after_exact_solves_blames_the_model(
+    tmp_path, monkeypatch, options, threshold
+):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
-    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
+    (tmp_path / "runaway.xml").write_text(
+        RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}')
+    )
     found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
-    assert found.n_diverged == 3 and found.n_unjudged > 0 and "random velocities" not in words_of(found)
+    assert (
+        found.n_diverged == 3
+        and found.n_unjudged > 0
+        and "random velocities" not in words_of(found)
+    )
     assert found.n_judged + found.n_unjudged == found.verdict.size
     assert found.n_judged == np.isfinite(found.numbers[0]).sum()
-    assert "3 worlds diverged, the first at step " in words_of(found) and "inf" not in words_of(found)
+    assert "3 worlds diverged, the first at step " in words_of(found) and "inf" not in words_of(
+        found
+    )
     assert np.isfinite(found.max_velocity_error)
     exact = options == ""  # One sweep of PGS does not hold the box.
     assert found.is_unconverged.any() == (not exact and threshold < 1.0)
@@ -188,16 +225,25 @@ def test_audit_rows_and_contacts_equal_those_of_mujoco(boxes):
 
 
 def test_audit_of_steps_without_contact_is_unmet(tmp_path):
-    (tmp_path / "high.xml").write_text(BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
+    (tmp_path / "high.xml").write_text(
+        BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20")
+    )
     found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
-    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in words_of(found) and found.is_unmet
+    assert (
+        "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in words_of(found)
+        and found.is_unmet
+    )
     none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
-    (tmp_path / "none.xml").write_text(none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"'))
+    (tmp_path / "none.xml").write_text(
+        none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"')
+    )
     found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
     assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in words_of(found)
 
 
-@pytest.mark.parametrize("names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")])
+@pytest.mark.parametrize(
+    "names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")]
+)
 def test_audit_from_stored_states_repeats_their_errors(boxes, tmp_path, names):
     path = boxes(EARLY)
     found = audit(path, worlds=3, steps=25, workers=1)
@@ -218,7 +264,14 @@ def test_audit_from_keyframes_starts_worlds_in_them(tmp_path, monkeypatch):
     (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
     found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
     assert found.contacts[:, 0].tolist() == [4, 0]
-    assert len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
+    assert (
+        len(
+            audit(
+                tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes"
+            ).runs.starts
+        )
+        == 1
+    )
     monkeypatch.setattr(module, "MAX_DEFAULT_WORLDS", 2)
     found = audit(tmp_path / "keyed.xml", steps=1, workers=1, states="keyframes")
     assert found.contacts[:, 0].tolist() == [4, 0]
@@ -230,11 +283,20 @@ REFUSED = [
         ({"states": arrays}, words)
         for arrays, words in (
             ({"qpos": np.zeros((2, NQ))}, "has no qvel"),
-            ({"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))}, "2 of qpos, 3 of qvel; one number above 0"),
+            (
+                {"qpos": np.zeros((2, NQ)), "qvel": np.zeros((3, NV))},
+                "2 of qpos, 3 of qvel; one number above 0",
+            ),
             ({"qpos": np.zeros((2, NQ - 1)), "qvel": np.zeros((2, NV))}, "qpos"),
             ({"qpos": np.full((1, NQ), np.nan), "qvel": np.zeros((1, NV))}, "qpos"),
-            ({"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))}, "0 of qpos, 0 of qvel; one number above 0"),
-            ({"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)}, "has an array 'speed'"),
+            (
+                {"qpos": np.zeros((0, NQ)), "qvel": np.zeros((0, NV))},
+                "0 of qpos, 0 of qvel; one number above 0",
+            ),
+            (
+                {"qpos": np.zeros((1, NQ)), "qvel": np.zeros((1, NV)), "speed": np.zeros(1)},
+                "has an array 'speed'",
+            ),
             ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"),
         )
     ),
@@ -253,7 +315,9 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
-def test_audit_with_a_wrong_argument_raises_an_error_that_names_it(boxes, tmp_path, monkeypatch, given, words):
+def test_audit_with_a_wrong_argument_raises_an_error_that_names_it(
+    boxes, tmp_path, monkeypatch, given, words
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "torn.npz").write_bytes(b"PK torn")
     if isinstance(given.get("states"), dict):
@@ -297,7 +361,9 @@ def test_audit_with_keep_has_the_worst_steps_of_a_world(boxes, tmp_path):
     assert len(np.load(tmp_path / "states.npz")["state"]) == 7
     terminal = Console(file=io.StringIO(), width=200)
     found.page.print_short(terminal)
-    assert [f"worst_{i}.npz" in terminal.file.getvalue() for i in range(1, 9)] == [True] * 7 + [False]
+    assert [f"worst_{i}.npz" in terminal.file.getvalue() for i in range(1, 9)] == [True] * 7 + [
+        False
+    ]
 
 
 def test_audit_keeps_states_before_steps_with_contact(boxes, tmp_path, monkeypatch):
@@ -309,12 +375,16 @@ def test_audit_keeps_states_before_steps_with_contact(boxes, tmp_path, monkeypat
     stored = np.load(tmp_path / "states.npz")
     assert (found.contacts[stored["world"], stored["step"]] > 0).all()
     again = audit(path, worlds=n, steps=1, workers=1, states=tmp_path / "states.npz")
-    assert again.numbers[0, :, 0] == pytest.approx(found.numbers[0, stored["world"], stored["step"]])
+    assert again.numbers[0, :, 0] == pytest.approx(
+        found.numbers[0, stored["world"], stored["step"]]
+    )
     with pytest.raises(lv.InputError, match="kind"):
         found.save_states("best", tmp_path / "states.npz")
 
 
-def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_forces(boxes, monkeypatch):
+def test_audit_of_an_engine_whose_acceleration_is_not_finite_does_not_judge_its_forces(
+    boxes, monkeypatch
+):
     """MJX returns forces of 0 with an acceleration of NaN, and goes on."""
 
     def change(arrays, step):

@@ -20,7 +20,9 @@ def judge_forward(model, data):
     copied = mj.MjData(model)
     mj.mj_setState(model, copied, get_state(model, data), mj.mjtState.mjSTATE_INTEGRATION)
     mj.mj_forward(model, copied)
-    return lv.residual(lv.io.from_mujoco(model, copied), lv.io.mujoco.impulse(model, copied)).velocity
+    return lv.residual(
+        lv.io.from_mujoco(model, copied), lv.io.mujoco.impulse(model, copied)
+    ).velocity
 
 
 def make_changed_model(options=EARLY):
@@ -45,15 +47,23 @@ def test_audit_judges_the_changed_model_in_memory_and_as_mjb_alike(boxes, tmp_pa
     for source in (model, tmp_path / "changed.mjb", str(tmp_path / "changed.mjb")):
         found = audit(source, worlds=1, steps=30, workers=1)
         np.testing.assert_allclose(found.numbers[0, 0], expected, rtol=1e-6, atol=1e-12)
-    assert not np.allclose(audit(boxes(EARLY), worlds=1, steps=30, workers=1).numbers[0, 0], expected)
+    assert not np.allclose(
+        audit(boxes(EARLY), worlds=1, steps=30, workers=1).numbers[0, 0], expected
+    )
 
 
 def test_audit_with_control_hold_keeps_the_controls_of_the_start_state(boxes, tmp_path):
     path = boxes(EARLY)
     model = mj.MjModel.from_xml_path(str(path))
-    states = {"qpos": model.qpos0[None], "qvel": np.zeros((1, model.nv)), "ctrl": np.full((1, model.nu), 0.7)}
+    states = {
+        "qpos": model.qpos0[None],
+        "qvel": np.zeros((1, model.nv)),
+        "ctrl": np.full((1, model.nu), 0.7),
+    }
     found = audit(path, worlds=1, steps=10, workers=1, control="hold", states=states)
-    same = audit(path, worlds=1, steps=10, workers=1, control=np.full((1, model.nu), 0.7), states=states)
+    same = audit(
+        path, worlds=1, steps=10, workers=1, control=np.full((1, model.nu), 0.7), states=states
+    )
     assert (found.numbers == same.numbers).all()
 
 
@@ -67,7 +77,9 @@ class Environment:
         self.data = mj.MjData(self.model)
         self.unwrapped = self
         self.length = length
-        self.action_space = SimpleNamespace(seed=self.seed_actions, sample=lambda: self.rng.uniform(-1.0, 1.0, 1))
+        self.action_space = SimpleNamespace(
+            seed=self.seed_actions, sample=lambda: self.rng.uniform(-1.0, 1.0, 1)
+        )
         self.errors = []  # Of every step, by the judge of one problem.
 
     def seed_actions(self, seed):
@@ -105,7 +117,10 @@ def test_audit_of_an_environment_judges_each_step_with_the_model_at_its_time(tmp
     found.write(tmp_path)
     # A state of the environment does not belong to the model that was loaded.
     loaded = mj.MjModel.from_xml_string(BOXES.format(options=EARLY))
-    assert "are of a model with other bodies" in read_states(mj, loaded, tmp_path / "states.npz").misfit
+    assert (
+        "are of a model with other bodies"
+        in read_states(mj, loaded, tmp_path / "states.npz").misfit
+    )
     notes = audit(loaded, worlds=1, steps=1, workers=1, states=tmp_path / "states.npz").advice
     assert any("give the changed model" in note for note in notes)
 
@@ -154,9 +169,12 @@ def test_audit_against_another_model_judges_both_on_the_same_states(boxes, tmp_p
     assert "Against other.xml, on the same 60 states" in found.headline[-1]
     own, its = (x.numbers[0][x.is_judged] for x in (found, found.against))
     smaller, larger = map(
-        float, re.search(r"smaller in ([\d.]+) % .* larger in ([\d.]+) %", found.headline[-1]).groups()
+        float,
+        re.search(r"smaller in ([\d.]+) % .* larger in ([\d.]+) %", found.headline[-1]).groups(),
     )
-    assert (smaller, larger) == pytest.approx((100 * (own < its).mean(), 100 * (own > its).mean()), abs=0.06)
+    assert (smaller, larger) == pytest.approx(
+        (100 * (own < its).mean(), 100 * (own > its).mean()), abs=0.06
+    )
     assert smaller != larger
     found.write(tmp_path / "out")
     assert (np.load(tmp_path / "out" / "records.npz")["against"] == found.against.numbers[0]).all()
@@ -173,7 +191,10 @@ def test_audit_stopped_by_ctrl_c_has_the_complete_worlds(boxes, tmp_path, monkey
     found = audit(path, worlds=4, steps=20, workers=1, watch=stop)
     assert found.is_stopped and found.n_processed == 40
     whole = audit(path, worlds=4, steps=20, workers=1)
-    assert found.numbers[:, :2].tobytes() == whole.numbers[:, :2].tobytes() and (found.verdict[2:] == -1).all()
+    assert (
+        found.numbers[:, :2].tobytes() == whole.numbers[:, :2].tobytes()
+        and (found.verdict[2:] == -1).all()
+    )
     found.write(tmp_path / "out")
     assert (np.load(tmp_path / "out" / "records.npz")["verdict"] == found.verdict).all()
     assert "Stopped before the end" in found.page.write(tmp_path / "out").read_text()
@@ -198,7 +219,9 @@ def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, 
             self.model = model
             self.data = mj.MjData(model)
             self.n = 0
-            self.action_space = type("Space", (), {"seed": lambda self, seed: None, "sample": lambda self: None})()
+            self.action_space = type(
+                "Space", (), {"seed": lambda self, seed: None, "sample": lambda self: None}
+            )()
 
         def reset(self, seed=None):
             self.n = 0
@@ -217,14 +240,22 @@ def test_audit_compares_the_next_velocities_with_the_predicted_ones(integrator, 
             data.qfrc_applied[0] = 7.0
 
     found = audit(Hooked(), policy=lambda observation: None, worlds=1, steps=5)
-    assert (found.prediction.steps, found.prediction.different, found.prediction.first) == (5, 1, (0, 2))
+    assert (found.prediction.steps, found.prediction.different, found.prediction.first) == (
+        5,
+        1,
+        (0, 2),
+    )
     assert "did not move as the judged answer predicts" in " ".join(found.advice)
 
 
 def test_audit_names_versions_settings_model_and_date():
     model = mj.MjModel.from_xml_string(BOXES.format(options=EARLY))
     found = audit(model, worlds=1, steps=5, workers=1).totals["provenance"]
-    assert (found["engine"], found["engine_version"], found["mujoco"]) == ("mujoco", mj.__version__, mj.__version__)
+    assert (found["engine"], found["engine_version"], found["mujoco"]) == (
+        "mujoco",
+        mj.__version__,
+        mj.__version__,
+    )
     assert found["lavender"] == lv.__version__
     assert found["model_hash"] == hash_model(model, options=True)[:12]
     assert found["integrator"] == "Euler" and found["timestep"] == model.opt.timestep

@@ -28,7 +28,9 @@ def step_of(errors, claimed, mass=1.0, nan=()):
     batch.names_of = lambda i: ["contact 7 (ground, foot)"]
     impulse = np.tile([mass, 0.0], (n, 1))
     impulse[:, 0] -= mass * np.array(errors)
-    return lv.io.EngineStep(batch, impulse, lv.io.Claims(np.array(claimed, bool), np.full(n, 3), {}))
+    return lv.io.EngineStep(
+        batch, impulse, lv.io.Claims(np.array(claimed, bool), np.full(n, 3), {})
+    )
 
 
 def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
@@ -57,7 +59,9 @@ def test_audit_steps_counts_each_outcome_of_claims(tmp_path):
 @pytest.mark.parametrize(("bad_step", "is_exact"), [(None, True), (0, False), (1, False)])
 def test_solves_before_a_divergence_are_exact_only_if_every_one_is(bad_step, is_exact):
     steps = [step_of([0.2 if k == bad_step else 0.0], [1]) for k in range(3)]
-    result = audit_steps(steps, threshold=1e3)  # a wrong step is close enough to the user, and not exact
+    result = audit_steps(
+        steps, threshold=1e3
+    )  # a wrong step is close enough to the user, and not exact
     assert result.has_exact_solves(Divergence(0, 2, "speed", False)) == is_exact
 
 
@@ -99,12 +103,19 @@ def test_audit_steps_stopped_by_ctrl_c_keeps_the_steps_so_far():
 
 def test_audit_steps_writes_the_states_before_the_worst_answers(tmp_path):
     steps = [
-        step_of([0.0, 0.2, 0.0], [1, 1, 0])._replace(state={"joint_q": np.array([[0.0], [1.0], [2.0]])}),
-        step_of([0.0, 0.0, 0.3], [1, 1, 0])._replace(state={"joint_q": np.array([[3.0], [4.0], [5.0]])}),
+        step_of([0.0, 0.2, 0.0], [1, 1, 0])._replace(
+            state={"joint_q": np.array([[0.0], [1.0], [2.0]])}
+        ),
+        step_of([0.0, 0.0, 0.3], [1, 1, 0])._replace(
+            state={"joint_q": np.array([[3.0], [4.0], [5.0]])}
+        ),
     ]
     audit_steps(steps, threshold=1e-4).write(tmp_path)
     with np.load(tmp_path / "states.npz") as file:
-        found = {(s, w): q[0] for s, w, q in zip(file["step"], file["world"], file["joint_q"], strict=True)}
+        found = {
+            (s, w): q[0]
+            for s, w, q in zip(file["step"], file["world"], file["joint_q"], strict=True)
+        }
     assert found[0, 1] == 1.0 and found[1, 2] == 5.0
     states = read_engine_states(tmp_path / "states.npz", NEWTON_STATE)
     assert list(states) == ["joint_q"] and states["joint_q"].shape == (len(found), 1)
@@ -124,7 +135,12 @@ def test_step_scene_of_newton_starts_from_stored_states(tmp_path):
         np.testing.assert_allclose(again[name], states[name], atol=1e-6)
     assert first.outcome.shape == (3, 4) and len(running[0].batch) == n
     with pytest.raises(lv.InputError, match="body_q has"):
-        step_scene(scene, "kamino", worlds=1, states={"body_q": np.zeros((1, 3, 7)), "body_qd": np.zeros((1, 3, 6))})
+        step_scene(
+            scene,
+            "kamino",
+            worlds=1,
+            states={"body_q": np.zeros((1, 3, 7)), "body_qd": np.zeros((1, 3, 6))},
+        )
     noisy = next(step_scene(scene, "kamino", worlds=3, steps=1, spread=0.1)).state
     assert np.ptp(noisy["body_qd"], axis=0).max() > 0.01
     assert not noisy["body_qd"][0].any()
@@ -140,18 +156,29 @@ def test_audit_of_steps_judged_in_pieces_equals_the_audit_of_one_piece(tmp_path)
         for at in np.split(np.arange(48), np.cumsum(sizes)[:-1]):
             answer = step_of(errors[at], np.ones(len(at)))
             ones = np.ones(len(at), int)
-            frame = Frame(answer.batch, answer.impulse, {}, rows=2 * ones, contacts=ones, n_dropped=len(at))
+            frame = Frame(
+                answer.batch, answer.impulse, {}, rows=2 * ones, contacts=ones, n_dropped=len(at)
+            )
             judging = Judging("float64", 1e-6, None, contact_share=0.25)
-            one.add_piece(judge_steps(frame, judging, world[at], step[at], lambda i: {"q": np.zeros(1)}), None)
+            one.add_piece(
+                judge_steps(frame, judging, world[at], step[at], lambda i: {"q": np.zeros(1)}), None
+            )
         found.append(one)
         assert one.n_dropped == 48 and one.where == found[0].where
         np.testing.assert_array_equal(one.numbers, found[0].numbers)
-        assert [(w.world, w.step, w.velocity) for w in one.worst] == [(w, 5, one.numbers[0, w, 5]) for w in (7, 6, 5)]
+        assert [(w.world, w.step, w.velocity) for w in one.worst] == [
+            (w, 5, one.numbers[0, w, 5]) for w in (7, 6, 5)
+        ]
         wrong = np.sort(one.numbers[0][one.is_unconverged])
         assert len(wrong) == 24 and one.errors["velocity, unconverged [m/s]"].iloc[0] == wrong[12]
-        assert one.errors["velocity [m/s]"].iloc[0] == np.quantile(one.numbers[0], 0.5, method="higher")
+        assert one.errors["velocity [m/s]"].iloc[0] == np.quantile(
+            one.numbers[0], 0.5, method="higher"
+        )
     first, last = (found[0].contact_states[i] for i in (0, -1))
-    assert len(found[0].contact_states) == 12 and (first.world, last.world) == (0, 7)  # All worlds have contact.
+    assert len(found[0].contact_states) == 12 and (first.world, last.world) == (
+        0,
+        7,
+    )  # All worlds have contact.
 
 
 def test_audit_is_unmet_for_each_reason_alone():

@@ -30,7 +30,9 @@ def dominant(explanation):
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_slip_below_the_friction_angle_is_softness_of_friction(cone):
     angle = 0.3  # tan 0.309 < 0.5
-    explanation = explain_slip_of_states(block(angle, option=f'cone="{cone}"'), steps=600).explanations[0]
+    explanation = explain_slip_of_states(
+        block(angle, option=f'cone="{cone}"'), steps=600
+    ).explanations[0]
     assert set(explanation.causes) == {"softness of friction"}
     hard = explanation.variants[3]
     assert hard.name == "hard" and hard.speeds.max() < 1e-6
@@ -48,7 +50,11 @@ def test_slip_of_a_creeping_block_has_the_speed_of_the_softened_row():
     tangent = int(data.contact.efc_address[0]) + 1
     explanation = explain_slip_of_states(model, steps=1501).explanations[0]
     force = GRAVITY * np.sin(angle) / data.ncon
-    damping = -data.efc_aref[tangent : tangent + 2] @ np.ones(2) / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
+    damping = (
+        -data.efc_aref[tangent : tangent + 2]
+        @ np.ones(2)
+        / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
+    )
     speed = data.efc_R[tangent] * force / damping
     assert explanation.variants[0].speeds == pytest.approx(np.full(data.ncon, speed), rel=0.02)
 
@@ -56,21 +62,30 @@ def test_slip_of_a_creeping_block_has_the_speed_of_the_softened_row():
 def test_slip_above_the_friction_angle_is_sliding_at_the_limit():
     angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
     steps = 150
-    explanation = explain_slip_of_states(block(angle, friction, 'cone="elliptic"'), steps=steps).explanations[0]
+    explanation = explain_slip_of_states(
+        block(angle, friction, 'cone="elliptic"'), steps=steps
+    ).explanations[0]
     assert set(explanation.causes) == {"sliding at the friction limit"}
     expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
-    assert explanation.variants[-1].speeds == pytest.approx(np.full(len(explanation.contacts), expected), rel=0.05)
+    assert explanation.variants[-1].speeds == pytest.approx(
+        np.full(len(explanation.contacts), expected), rel=0.05
+    )
 
 
 def test_slip_with_one_iteration_is_unfinished_solving():
-    model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
+    model = block(
+        0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"'
+    )
     exact = block(0.3, option='cone="elliptic" impratio="1000"')
     assert dominant(explain_slip_of_states(exact, steps=40).explanations[0]) != "unfinished solving"
     data = mujoco.MjData(exact)
     for _ in range(40):
         mujoco.mj_step(exact, data)
     data.qacc_warmstart[:] = 0.0
-    assert dominant(explain_slip_of_states(model, get_state(exact, data)[None]).explanations[0]) == "unfinished solving"
+    assert (
+        dominant(explain_slip_of_states(model, get_state(exact, data)[None]).explanations[0])
+        == "unfinished solving"
+    )
 
 
 def test_slip_of_an_unfinished_acceleration_is_the_speed_of_the_corners_after_the_step():
@@ -85,8 +100,16 @@ def test_slip_of_an_unfinished_acceleration_is_the_speed_of_the_corners_after_th
     mujoco.mj_forward(model, by_forces)
     explanation = explain_slip_of_states(model, state[None]).explanations[0]
     moved, by_forces = (
-        [np.linalg.norm(v[:2] + np.cross(v[3:], by_forces.contact.pos[k] - by_forces.xpos[1])[:2]) for k in range(4)]
-        for v in (data.qvel, lv.io.from_mujoco(model, by_forces).velocity(lv.io.mujoco.impulse(model, by_forces)))
+        [
+            np.linalg.norm(
+                v[:2] + np.cross(v[3:], by_forces.contact.pos[k] - by_forces.xpos[1])[:2]
+            )
+            for k in range(4)
+        ]
+        for v in (
+            data.qvel,
+            lv.io.from_mujoco(model, by_forces).velocity(lv.io.mujoco.impulse(model, by_forces)),
+        )
     )
     np.testing.assert_allclose(np.sort(explanation.variants[0].speeds), np.sort(moved), rtol=1e-4)
     assert np.abs(np.sort(by_forces) - np.sort(moved)).max() > 1e-3 * max(moved)
@@ -97,7 +120,13 @@ def slide(velocity, cones, friction="coulomb", compliance=None):
     jac = np.eye(3)[[2, 0, 1]]
     free = [*velocity, -1.0]
     return lv.Problem.from_jacobian(
-        jac, np.eye(3), free, cones=cones, friction=friction, compliance=compliance, names=["contact 0 (foot, ground)"]
+        jac,
+        np.eye(3),
+        free,
+        cones=cones,
+        friction=friction,
+        compliance=compliance,
+        names=["contact 0 (foot, ground)"],
     )
 
 
@@ -117,11 +146,17 @@ def test_slip_in_a_box_has_the_part_of_the_shape():
     problem = slide([1.0, 1.0], lv.Cones.contacts(0.5).shaped("box"))
     explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
     speeds = {v.name: v.speeds[0] for v in explanation.variants}
-    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(np.sqrt(2.0) - 0.5)
-    assert explanation.parts["shape of the cone"] == pytest.approx([np.sqrt(2.0) - 0.5 - np.sqrt(0.5)])
+    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(
+        np.sqrt(2.0) - 0.5
+    )
+    assert explanation.parts["shape of the cone"] == pytest.approx(
+        [np.sqrt(2.0) - 0.5 - np.sqrt(0.5)]
+    )
 
 
-@pytest.mark.parametrize(("grip", "cause"), [(30.0, "softness of friction"), (6.0, "sliding at the friction limit")])
+@pytest.mark.parametrize(
+    ("grip", "cause"), [(30.0, "softness of friction"), (6.0, "sliding at the friction limit")]
+)
 def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
     # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
@@ -133,7 +168,9 @@ def test_slip_of_a_gripped_box_depends_on_the_grip_force(grip, cause):
       <body pos="0 0 1"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
       <actuator><motor joint="left" ctrllimited="false"/><motor joint="right" ctrllimited="false"/></actuator>
       <keyframe><key ctrl="{grip} {grip}"/></keyframe></mujoco>""")
-    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20).explanations[0]
+    explanation = explain_slip_of_states(model, "keyframes", contacts="box", steps=20).explanations[
+        0
+    ]
     assert dominant(explanation) == cause
 
 
@@ -141,11 +178,15 @@ def test_slip_advice_lists_only_settings_that_reduce_simulated_slip():
     soft = explain_slip_of_states(block(0.3, option='cone="elliptic"'), steps=600).explanations[0]
     as_it_is, *others = soft.remedies
     advised = [line.strip().rpartition(": ")[0] for line in soft.advice[1:]]
-    helpful = [r.setting for r in sorted(others, key=lambda r: r.later) if r.later <= 0.9 * as_it_is.later]
+    helpful = [
+        r.setting for r in sorted(others, key=lambda r: r.later) if r.later <= 0.9 * as_it_is.later
+    ]
     assert advised == helpful and '<option impratio="10"/>' in advised
     # A larger friction coefficient does not reduce creep, although it is the first idea.
     assert 'friction="1" of slope and box' in {r.setting for r in others} - set(advised)
-    stiff = explain_slip_of_states(block(0.3, option='cone="elliptic" impratio="10"'), steps=600).explanations[0]
+    stiff = explain_slip_of_states(
+        block(0.3, option='cone="elliptic" impratio="10"'), steps=600
+    ).explanations[0]
     # The creep of a softened row is proportional to its compliance, which impratio divides; 5 leaves room for the load.
     assert stiff.variants[0].speeds.max() < soft.variants[0].speeds.max() / 5.0
 
@@ -154,12 +195,17 @@ def test_slip_remedies_start_from_all_states_with_the_fastest_contact():
     model = block(0.2, friction=0.4, option='cone="elliptic"')
     speeds = np.array([0.5, 1.0, 0.2])
     model.qpos0[2] -= 0.0001  # The box touches the slope in its first step.
-    states = {"qpos": np.repeat(model.qpos0[None], 3, axis=0), "qvel": speeds[:, None] * np.eye(model.nv)[:1]}
+    states = {
+        "qpos": np.repeat(model.qpos0[None], 3, axis=0),
+        "qvel": speeds[:, None] * np.eye(model.nv)[:1],
+    }
     explanations = explain_slip_of_states(model, states, steps=1).explanations
     assert [e.n_states for e in explanations] == [0, 3, 0]
     parts = [{k: x[i : i + 1] for k, x in states.items()} for i in range(3)]
     alone = [explain_slip_of_states(model, part, steps=1).explanations[0] for part in parts]
-    assert explanations[1].remedies[0].slip == pytest.approx(np.mean([e.remedies[0].slip for e in alone]))
+    assert explanations[1].remedies[0].slip == pytest.approx(
+        np.mean([e.remedies[0].slip for e in alone])
+    )
 
 
 def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
@@ -175,7 +221,9 @@ def conveyor(form, belt=1.0, compliance=0.0, mu=0.5):
             arm_a=[(0.0, 0.0, 0.0)],
             arm_b=[(0.0, 0.0, 0.0)],
         )
-        return lv.Problem.from_rows(rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance])
+        return lv.Problem.from_rows(
+            rows, mu=mu, target=[0.0, belt, 0.0], compliance=[0.0, compliance, compliance]
+        )
     return lv.Problem.from_jacobian(
         np.eye(3)[[2, 0, 1]],
         np.eye(3),
@@ -251,7 +299,9 @@ def test_explain_slip_of_states_remedy_has_the_slip_that_the_typed_setting_gives
             for jacobian, point in zip(jacobians, data.contact.pos, strict=True):
                 mujoco.mj_jac(typed, data, jacobian, None, point, 1)
             mujoco.mj_step(typed, data)
-            means.append(np.linalg.norm((jacobians @ data.qvel)[:, :2], axis=1).mean())  # The normal is z.
+            means.append(
+                np.linalg.norm((jacobians @ data.qvel)[:, :2], axis=1).mean()
+            )  # The normal is z.
         assert remedy.slip == pytest.approx(means[0], rel=1e-6, abs=1e-12), text
         assert remedy.later == pytest.approx(np.mean(means[1:]), rel=1e-6, abs=1e-12), text
     best = min(explanation.remedies, key=lambda remedy: remedy.later)

@@ -42,14 +42,21 @@ def test_tune_measures_the_present_setting_on_half_of_the_worlds(boxes, monkeypa
 def test_tune_of_the_converged_setting_has_no_motion_error(boxes):
     runs = Runs.of_model(boxes(), 1, 20)
     stage = Stage.from_stretches_of_runs(runs, [0], 10)
-    same = stage.judge_setting(Setting.from_options(mj, runs.model, **mujoco_settings.CONVERGED_OPTIONS))
+    same = stage.judge_setting(
+        Setting.from_options(mj, runs.model, **mujoco_settings.CONVERGED_OPTIONS)
+    )
     assert same.motion.max() == 0.0 and same.worst_error < 1e-9
 
 
-@pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
+@pytest.mark.parametrize(
+    "options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"']
+)
 def test_option_line_pasted_into_a_model_gives_the_measured_options(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
-    for setting in [*list_first_settings(mj, plain), *mujoco_settings.list_variants(mj, plain, Setting())]:
+    for setting in [
+        *list_first_settings(mj, plain),
+        *mujoco_settings.list_variants(mj, plain, Setting()),
+    ]:
         text = setting.option_line.removeprefix("<option").removesuffix("/>")
         names = {name for name, _ in setting.options}
         kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
@@ -105,7 +112,12 @@ TUNINGS = {
     "20 of 100 steps have contact": of_contacts(chosen(NOW, QUICK), 20),
     "no step has contact, and no geoms can touch": of_contacts(chosen(NOW, QUICK), 0, False),
     "a faster, a more accurate, and a setting that changes the problem": chosen(
-        NOW, QUICK, measured(2.0, 1e-1, iterations=1), measured(10.2, 1e-5, tolerance=1e-9), SLOW, OTHER
+        NOW,
+        QUICK,
+        measured(2.0, 1e-1, iterations=1),
+        measured(10.2, 1e-5, tolerance=1e-9),
+        SLOW,
+        OTHER,
     ),
     "of equally fast settings the largest limit of iterations": chosen(
         measured(10.0, 1e-3, iterations=15),
@@ -114,24 +126,32 @@ TUNINGS = {
         measured(8.0, 1e-17, iterations=99),
     ),
     "an equally fast setting with a larger error is not as accurate": chosen(
-        measured(10.0, 1e-3, iterations=15), measured(7.0, 3e-16, iterations=3), measured(7.2, 2e-6, iterations=10)
+        measured(10.0, 1e-3, iterations=15),
+        measured(7.0, 3e-16, iterations=3),
+        measured(7.2, 2e-6, iterations=10),
     ),
     "a larger median error is not as accurate, though the largest error is smaller": chosen(
         first_step(measured(10.0, 1e-4), 1e-1), QUICK
     ),
     "a smaller median error is as accurate, though 40 of 100 errors are larger": chosen(
-        first_step(measured(10.0, 1e-4), 1e-1), replace(QUICK, error=np.repeat([1e-5, 1e-3], [60, 40]))
+        first_step(measured(10.0, 1e-4), 1e-1),
+        replace(QUICK, error=np.repeat([1e-5, 1e-3], [60, 40])),
     ),
     "the fastest of those within 1e-3 in every step": LIMITED,
-    "the choice exceeds 1e-3 on the worlds held back": replace(LIMITED, held_errors={GOOD.setting: 2e-3}),
+    "the choice exceeds 1e-3 on the worlds held back": replace(
+        LIMITED, held_errors={GOOD.setting: 2e-3}
+    ),
     "no setting within 1e-12": replace(LIMITED, error_limit=1e-12),
     "no limit": FIVE,
     "two settings within 1e-3 and the noise of times": replace(
-        chosen(measured(10.0, 0.1), GOOD, measured(12.012, 1e-8, iterations=30), SLOW), error_limit=1e-3
+        chosen(measured(10.0, 0.1), GOOD, measured(12.012, 1e-8, iterations=30), SLOW),
+        error_limit=1e-3,
     ),
     "the present setting is within 0.2": replace(chosen(NOW, SLOW), error_limit=0.2),
     "gains within noise and below the threshold": chosen(
-        measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9), measured(10.0, 1e-12, tolerance=1e-12)
+        measured(10.0, 1e-9),
+        measured(9.8, 1e-9, iterations=9),
+        measured(10.0, 1e-12, tolerance=1e-12),
     ),
     "an error that is larger than now and below the threshold": chosen(
         measured(10.0, 1e-9), measured(5.0, 1e-7, tolerance=1e-4)
@@ -149,7 +169,11 @@ def test_tuning_has_its_approved_recommendation(name):
     of = {"faster": found.faster, "closer": found.closer, "within the limit": found.within_limit}
     of = {word: setting.setting.option_line for word, setting in of.items() if setting is not None}
     front = [m.setting.option_line or "the present setting" for m in found.pareto_front]
-    met = f"is_limit_met: {found.page.numbers['is_limit_met']}" if found.error_limit is not None else ""
+    met = (
+        f"is_limit_met: {found.page.numbers['is_limit_met']}"
+        if found.error_limit is not None
+        else ""
+    )
     parts = [
         *found.headline,
         format_cells(found.choices).to_string(index=False),
@@ -168,21 +192,35 @@ def test_tuning_choice_does_not_depend_on_the_worlds_held_back():
     before = chosen(now, first, second)
     for error in (1e-9, 16.0, 1e9):
         held = [measured(10.0, 31.0), replace(first, error=np.full(100, error))]
-        after = replace(before, held=held, held_errors={m.setting: float(m.error.max()) for m in held})
+        after = replace(
+            before, held=held, held_errors={m.setting: float(m.error.max()) for m in held}
+        )
         assert (after.faster, after.closer) == (before.faster, before.closer) == (first, first)
         assert after.choices["time, held back"].tolist()[1] == "0.90"
 
 
 @pytest.mark.parametrize(("limit", "is_met"), [(1e-6, True), (0.0, False)])
 def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatch, limit, is_met):
-    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-3, 1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"})
+    keep_values(
+        monkeypatch, mujoco_settings, "MUJOCO", {1e-3, 1e-6, 1e-12, 2, 3, 25}, {"Newton", "CG"}
+    )
     found = tune(boxes(EARLY), worlds=4, steps=30, repeats=1, max_velocity_error=limit)
     choice = found.limit_choice
     (held,) = (h for h in found.held if h.setting == choice.setting)
-    assert np.isfinite(held.mean_step_time) and found.held_errors[choice.setting] == held.error.max()
-    assert (found.within_limit is choice) == is_met == (max(choice.error.max(), held.error.max()) <= limit)
+    assert (
+        np.isfinite(held.mean_step_time) and found.held_errors[choice.setting] == held.error.max()
+    )
+    assert (
+        (found.within_limit is choice)
+        == is_met
+        == (max(choice.error.max(), held.error.max()) <= limit)
+    )
     for m in found.measured:  # Every faster setting exceeds the limit on one half of the worlds.
-        if is_met and m.mean_step_time < 0.95 * choice.mean_step_time and not m.setting.changes_problem:
+        if (
+            is_met
+            and m.mean_step_time < 0.95 * choice.mean_step_time
+            and not m.setting.changes_problem
+        ):
             assert max(m.error.max(), found.held_errors.get(m.setting, 0.0)) > limit
     shown = found.choices[found.choices["choice"].str.startswith(("most accurate", "fastest"))]
     assert len(shown) == 1 and "–" not in shown["time, held back"].tolist()
@@ -190,7 +228,13 @@ def test_tune_with_an_error_limit_meets_it_on_held_back_worlds(boxes, monkeypatc
 
 def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkeypatch):
     """The times of a step follow from the options here, so that both runs choose from equal times."""
-    keep_values(monkeypatch, mujoco_settings, "MUJOCO", {1e-4, 1e-6, 1e-12, 1, 3, 6, 25}, {"Newton", "CG", "PGS"})
+    keep_values(
+        monkeypatch,
+        mujoco_settings,
+        "MUJOCO",
+        {1e-4, 1e-6, 1e-12, 1, 3, 6, 25},
+        {"Newton", "CG", "PGS"},
+    )
     run = Stage.run_stretches
     judge = Stage.judge_setting
     n_runs = []
@@ -198,7 +242,9 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
     def take_time_of_options(self, model, states=None):
         n_runs.append(states is None)
         times, ends = run(self, model, states)
-        cost = model.opt.iterations - np.log10(max(model.opt.tolerance, 1e-16)) + 20 * model.opt.solver
+        cost = (
+            model.opt.iterations - np.log10(max(model.opt.tolerance, 1e-16)) + 20 * model.opt.solver
+        )
         return np.full(len(times), 1e-6 * cost), ends
 
     monkeypatch.setattr(Stage, "run_stretches", take_time_of_options)
@@ -209,7 +255,9 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
         part = tune(path, **same)
         n_part = n_runs.count(True)
         with monkeypatch.context() as whole:
-            whole.setattr(Stage, "judge_setting", lambda self, setting, _=None: judge(self, setting))
+            whole.setattr(
+                Stage, "judge_setting", lambda self, setting, _=None: judge(self, setting)
+            )
             all_steps = tune(path, **same)
         assert n_part < n_runs.count(True) - n_part
         n_runs.clear()
@@ -218,7 +266,9 @@ def test_settings_that_are_judged_in_part_do_not_change_the_choice(boxes, monkey
         for name in ("faster", "closer", "limit_choice"):
             one, other = getattr(part, name), getattr(all_steps, name)
             found.append(one)
-            assert (one is None) == (other is None) and (one is None or one.setting == other.setting)
+            assert (one is None) == (other is None) and (
+                one is None or one.setting == other.setting
+            )
     assert any(m is not None and m.setting.options for m in found)
 
 
@@ -235,7 +285,9 @@ def test_tune_measures_the_default_options_of_mujoco(boxes, monkeypatch):
     assert found.choices["choice"].tolist()[0] == "now"
     assert any(name.startswith("MuJoCo's defaults (") for name in found.choices["option"])
     # A model with the default options: its own setting is not measured twice.
-    assert not any(m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured)
+    assert not any(
+        m.setting.is_default for m in tune(boxes(), worlds=2, steps=10, repeats=1).measured
+    )
 
 
 def test_tune_stopped_by_ctrl_c_returns_the_measured_settings(boxes, monkeypatch, tmp_path):

@@ -20,7 +20,13 @@ def test_right_is_the_optimum_within_its_rows_and_nothing_else():
     n = len(arrays["q"])
     for wrong in (np.zeros(n), np.full(n, np.nan), np.full(n, 1e3)):
         assert not corpus.is_right(arrays, OPTIMA["DUALC1"], wrong)
-    rows = {"P": np.eye(2), "q": np.zeros(2), "A": np.ones((1, 2)), "b": np.ones(1), "lb": np.zeros(2)}
+    rows = {
+        "P": np.eye(2),
+        "q": np.zeros(2),
+        "A": np.ones((1, 2)),
+        "b": np.ones(1),
+        "lb": np.zeros(2),
+    }
     assert corpus.is_right(rows, 0.25, np.array([0.5, 0.5]))
     assert not corpus.is_right(rows | {"b": np.full(1, 1.1)}, 0.25, np.array([0.5, 0.5]))
     assert not corpus.is_right(rows | {"lb": np.full(2, 0.6)}, 0.25, np.array([0.5, 0.5]))
@@ -29,8 +35,12 @@ def test_right_is_the_optimum_within_its_rows_and_nothing_else():
 
 def test_two_checkouts_answer_alike_and_survive_an_error(tmp_path):
     sides = [corpus.Checkout(corpus.ROOT), corpus.Checkout(corpus.ROOT)]
-    [group] = {group for group, _ in corpus.write_drawn_problems(1, tmp_path) if group == "drawn: suite"}
-    rows = list(corpus.compare_problems(sides, [(group, tmp_path / "suite_0.npz")], ("auto", "no_such")))
+    [group] = {
+        group for group, _ in corpus.write_drawn_problems(1, tmp_path) if group == "drawn: suite"
+    }
+    rows = list(
+        corpus.compare_problems(sides, [(group, tmp_path / "suite_0.npz")], ("auto", "no_such"))
+    )
     assert corpus.is_solved(rows[0]["base"]) and rows[0]["base"]["work"] == rows[0]["head"]["work"]
     assert "UnknownName" in rows[1]["base"]["status"] and not corpus.is_solved(rows[1]["head"])
     assert [line[:5] for line in corpus.summarize(rows)] == [

@@ -49,7 +49,9 @@ def test_bench_peers_every_adapter_solves_the_same_problem(kind):
         assert least is None or least < 1e-4, f"{contestant.name} on {SMALL[kind]}: {least:.1e}"
 
 
-def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
+def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(
+    tmp_path, monkeypatch
+):
     out = tmp_path / "peers.json"
     steps = []
 
@@ -65,7 +67,9 @@ def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(tm
     assert [s["engine"] for s in json.loads(out.read_text())["steps"]] == [s.engine for s in steps]
     assert [s.engine for s in steps[:2]] == ["lavender, 16 sweeps", "lavender newton"]
     for package in ("mujoco", "pybullet"):
-        assert any(package in s.engine for s in steps) == (importlib.util.find_spec(package) is not None)
+        assert any(package in s.engine for s in steps) == (
+            importlib.util.find_spec(package) is not None
+        )
     for s in steps:
         assert s.time > 0.0 and s.note == "" and f"| stack6 | {s.engine} |" in done.output
         # Four points under each of six boxes; MuJoCo adds a few between edges while PGS lets boxes tilt.

@@ -56,7 +56,9 @@ def test_bench_scale_exponent_of_a_power_law_is_its_power():
         (["--case", "granularF(n=3, sliding=0.5)"], "granularF(n=3, sliding=0.5)"),
     ],
 )
-def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(tmp_path, arguments, structure):
+def test_command_measures_auto_and_a_mix_and_writes_what_it_measured(
+    tmp_path, arguments, structure
+):
     out = tmp_path / "scale.json"
     mix = ["--solvers", "sweeps, relaxed then exact", "--out", str(out)]
     done = CliRunner().invoke(command, [*arguments, *mix])

@@ -47,7 +47,11 @@ def follow(position, velocity, spin=(0, 0, 0)):
         moving = [body for body in scene["bodies"] if body["mass"] > 0]
         x = np.zeros((len(t), len(moving), 13))
         for i, body in enumerate(moving):
-            x[:, i, :3], x[:, i, 3:7], x[:, i, 7:10] = body["position"], body["quaternion"], body["velocity"]
+            x[:, i, :3], x[:, i, 3:7], x[:, i, 7:10] = (
+                body["position"],
+                body["quaternion"],
+                body["velocity"],
+            )
         x[:, -1, :3] += np.array([position(s) for s in t])
         x[:, -1, 7:10] = [velocity(s) for s in t]
         x[:, -1, 10:13] = [spin(s) if callable(spin) else spin for s in t]
@@ -88,7 +92,9 @@ def test_score_of_an_exact_motion_is_zero():
     exact = {
         "stick": rest,
         "slip": follow(along(lambda t: a * t * t / 2), along(lambda t: a * t)),
-        "slide": follow(along(lambda t: 3 * min(t, stop) - 0.5 * 9.81 * min(t, stop) ** 2 / 2), still),
+        "slide": follow(
+            along(lambda t: 3 * min(t, stop) - 0.5 * 9.81 * min(t, stop) ** 2 / 2), still
+        ),
         "roll": follow(still, along(lambda t: 2 - 0.3 * 9.81 * min(t, roll))),
         "stack": rest,
         "ratio": rest,
@@ -102,7 +108,9 @@ def test_score_of_an_exact_motion_is_zero():
         error = scenes.SCENES[name].measure(run, DT)
         assert (error[0] if isinstance(error, tuple) else error) < 1e-12, name
     assert scenes.measure_stick(follow(along(lambda t: 0.01 * t), still), DT) == pytest.approx(0.01)
-    assert scenes.measure_cards(follow(lambda t: (0, 0, -0.02 * t), still), DT) == pytest.approx(0.1)
+    assert scenes.measure_cards(follow(lambda t: (0, 0, -0.02 * t), still), DT) == pytest.approx(
+        0.1
+    )
 
 
 def test_score_of_bounces_between_steps_vanishes_with_the_step():
@@ -122,7 +130,9 @@ def test_score_of_a_slope_finds_the_friction_coefficient_of_each_heading():
         return np.array([0.0, 2.0]), x
 
     error, found = scenes.measure_heading(run, DT)
-    assert found == pytest.approx([0.5 / math.cos(math.radians(h)) for h in scenes.HEADINGS], abs=2e-3)
+    assert found == pytest.approx(
+        [0.5 / math.cos(math.radians(h)) for h in scenes.HEADINGS], abs=2e-3
+    )
     assert error == pytest.approx(0.5 * math.sqrt(2) - 0.5, abs=2e-3)
 
 
@@ -137,12 +147,19 @@ def test_score_of_a_gap_is_the_distance_of_the_anchors():
     x = np.zeros((1, 2, 13))
     x[0, :, 3], x[0, 1, 2] = 1.0, 0.5
     assert scenes.measure_gaps(scene, x) == pytest.approx(0.0)
-    x[0, 1, 3:7] = math.cos(0.1), 0, math.sin(0.1), 0  # turns the second body by 0.2 rad about its centre
+    x[0, 1, 3:7] = (
+        math.cos(0.1),
+        0,
+        math.sin(0.1),
+        0,
+    )  # turns the second body by 0.2 rad about its centre
     assert scenes.measure_gaps(scene, x) == pytest.approx(2 * 0.3 * math.sin(0.1))
 
 
 def test_score_of_a_free_box_is_the_change_of_its_angular_momentum():
-    slower = scenes.measure_tumble(follow(still, still, lambda t: np.array((1, 4, 1)) * (1 - 0.01 * t)), DT)
+    slower = scenes.measure_tumble(
+        follow(still, still, lambda t: np.array((1, 4, 1)) * (1 - 0.01 * t)), DT
+    )
     inertia = np.array([0.13, 0.1, 0.05]) / 12
     assert slower == pytest.approx(0.1 * np.linalg.norm(inertia * (1, 4, 1)))
 
@@ -160,16 +177,32 @@ def test_score_of_lavender_has_the_published_errors(tmp_path):
 def test_score_runs_only_cells_that_the_table_lacks(tmp_path):
     def run(*arguments):
         return CliRunner().invoke(
-            command, ["--engine", "lavender", "--rate", "240", "--out", str(tmp_path / "table.csv"), *arguments]
+            command,
+            [
+                "--engine",
+                "lavender",
+                "--rate",
+                "240",
+                "--out",
+                str(tmp_path / "table.csv"),
+                *arguments,
+            ],
         )
 
     first = run("--scene", "stick,roll", "--level", "default")
     assert first.exit_code == 0 and first.output.count("µs a step") == 2
     second = run("--scene", "stick,roll,slip", "--level", "default", "--repeat", "1")
     assert second.output.count("µs a step") == 1 and "| LavenderSim |" in second.output
-    assert run("--scene", "stick", "--level", "default", "--repeat", "2").output.count("µs a step") == 1
+    assert (
+        run("--scene", "stick", "--level", "default", "--repeat", "2").output.count("µs a step")
+        == 1
+    )
     rows = read_records(tmp_path / "table.csv")
-    assert sorted((row.scene, row.runs) for row in rows.values()) == [("roll", 1), ("slip", 1), ("stick", 2)]
+    assert sorted((row.scene, row.runs) for row in rows.values()) == [
+        ("roll", 1),
+        ("slip", 1),
+        ("stick", 2),
+    ]
 
 
 def test_score_table_of_the_repository_has_the_pinned_versions():
@@ -185,15 +218,27 @@ def test_score_page_has_the_tables_of_records_and_settings(monkeypatch):
     drawing = importlib.import_module("scorecard")
     page = (ROOT / "docs" / "scorecard.md").read_text(encoding="utf-8")
     rows = read_records()
-    for table in (drawing.make_scene_table(), drawing.make_settings_table(), drawing.make_residual_table(rows)):
+    for table in (
+        drawing.make_scene_table(),
+        drawing.make_settings_table(),
+        drawing.make_residual_table(rows),
+    ):
         assert table in page
     for name in ENGINES:
-        assert all(drawing.find(rows, name, level, scene) for level in drawing.COLUMNS for scene in scenes.SCENES), name
+        assert all(
+            drawing.find(rows, name, level, scene)
+            for level in drawing.COLUMNS
+            for scene in scenes.SCENES
+        ), name
 
 
 def test_score_page_has_the_numbers_of_the_table():
     text = re.sub(r"\s+", " ", (ROOT / "docs" / "scorecard.md").read_text(encoding="utf-8"))
-    rows = [row for row in read_records().values() if (row.level, row.rate) == ("default", 240) and not row.note]
+    rows = [
+        row
+        for row in read_records().values()
+        if (row.level, row.rate) == ("default", 240) and not row.note
+    ]
     passed = Counter(row.engine for row in rows if scenes.classify(row.scene, row.error) < 2)
     assert max(passed, key=passed.get) == "physx"
     total = len(scenes.SCENES)

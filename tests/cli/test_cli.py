@@ -23,27 +23,44 @@ QUICK = ("--tolerances", "1e-3,1e-6", "--budgets", "2,4", "--repeats", "1", "--n
 
 def test_report_and_check_of_a_false_claim_mark_it_contradicted(lavender, path, plug_in):
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "liar", laws={"lcp"})
-    code, out, _ = lavender("report", path, "--solvers", "liar", *QUICK[:2], *QUICK[-3:], "--tables")
+    code, out, _ = lavender(
+        "report", path, "--solvers", "liar", *QUICK[:2], *QUICK[-3:], "--tables"
+    )
     assert code == 0
-    assert "false claim, the first of 2: liar on stack8: says CONVERGED" in out and "✗ says CONVERGED" in out
+    assert (
+        "false claim, the first of 2: liar on stack8: says CONVERGED" in out
+        and "✗ says CONVERGED" in out
+    )
     code, out, _ = lavender("check", path, "--solvers", "liar")
     assert code == 1
     assert "claim contradicted" in out and "1 claims are contradicted" in out
 
 
 @pytest.mark.parametrize(("a", "code"), [(-1.0, 3), (0.0, 1)])
-def test_solve_command_ends_with_3_only_for_a_proven_claim_of_infeasibility(lavender, tmp_path, plug_in, a, code):
+def test_solve_command_ends_with_3_only_for_a_proven_claim_of_infeasibility(
+    lavender, tmp_path, plug_in, a, code
+):
     """With A = [[1, -1], [-1, 1]] and b = (1, 1), y = (1, 1) proves that there is no solution."""
-    plug_in(lambda problem, impulse: lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2)), "unsure", laws={"lcp"})
+    plug_in(
+        lambda problem, impulse: lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2)),
+        "unsure",
+        laws={"lcp"},
+    )
     lv.Problem.lcp([[1.0, a], [a, 1.0]], [1.0, 1.0]).save(tmp_path / "p.npz")
     assert lavender("solve", tmp_path / "p.npz", "--solver", "unsure")[0] == code
 
 
-def test_contract_of_a_false_solver_ends_with_1_and_names_unmet_requirements(lavender, plug_in, tmp_path):
+def test_contract_of_a_false_solver_ends_with_1_and_names_unmet_requirements(
+    lavender, plug_in, tmp_path
+):
     code, out, _ = lavender("contract", "sor")
     assert code == 0 and "NOT MET" not in out
     assert "orders_change_the_sweep" not in out  # sor has orders
-    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}), "liar", laws={"lcp"})
+    plug_in(
+        lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}),
+        "liar",
+        laws={"lcp"},
+    )
     code, out, _ = lavender("contract", "liar", "--out", str(tmp_path / "unmet"))
     assert code == cli.EXIT_UNMET
     assert "NOT MET  Every problem that the spec accepts is solved" in out
@@ -70,7 +87,12 @@ def options_of_real_numbers():
     """(Command, option) of every command."""
     for command in entry.cli.list_commands(click.Context(entry.cli)):
         for option in entry.cli.get_command(click.Context(entry.cli), command).params:
-            if getattr(option.type, "kind", float if option.type.name.startswith("float") else None) is float:
+            if (
+                getattr(
+                    option.type, "kind", float if option.type.name.startswith("float") else None
+                )
+                is float
+            ):
                 yield command, option.opts[0]
 
 
@@ -127,7 +149,9 @@ def test_doctor_of_a_problem_with_duplicates_lists_them(lavender, path):
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
     assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
     assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
-    assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [1, 2]
+    assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0][
+        "blocks"
+    ] == [1, 2]
 
 
 def _must_not_begin(*_, **__):
@@ -149,10 +173,14 @@ def _must_not_begin(*_, **__):
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
-def test_command_with_an_unwritable_output_ends_with_2_before_work(lavender, monkeypatch, tmp_path, words, work):
+def test_command_with_an_unwritable_output_ends_with_2_before_work(
+    lavender, monkeypatch, tmp_path, words, work
+):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(work, _must_not_begin)
-    for place in ("file",) if "/sub" in words else ("file", "absent"):  # a folder is made, with its parents
+    for place in (
+        ("file",) if "/sub" in words else ("file", "absent")
+    ):  # a folder is made, with its parents
         code, out, err = lavender(*words.format(tmp_path / place).split())
         assert (code, out) == (cli.EXIT_BAD_INPUT, "")
         assert re.search(r"^lavender: cannot (write|create) .*", err)
@@ -162,7 +190,11 @@ def test_command_with_an_unwritable_output_ends_with_2_before_work(lavender, mon
 def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender, tmp_path):
     problem = robot(2)
     exact = lv.solve(problem, tol=1e-11).impulse
-    for name, impulse in (("done", exact.astype(np.float32)), ("early", 0.9 * exact), ("none", None)):
+    for name, impulse in (
+        ("done", exact.astype(np.float32)),
+        ("early", 0.9 * exact),
+        ("none", None),
+    ):
         lv.io.save(problem, tmp_path / f"{name}.npz", impulse=impulse)
     told = ("--solvers", "pgs", "--precision", "float32")
     code, out, err = lavender("check", tmp_path / "done.npz", *told)
@@ -186,15 +218,24 @@ def test_check_of_a_stored_answer_ends_with_1_only_if_its_error_exceeds_the_thre
     impulse = lv.solve(problem, tol=1e-11).impulse * (1.0 + 1e-4)
     assert 1e-5 < lv.residual(problem, impulse).velocity < 1e-3
     lv.io.save(problem, tmp_path / "p.npz", impulse=impulse)
-    assert lavender("check", tmp_path / "p.npz", "--solvers", "auto", "--threshold", threshold)[0] == code
+    assert (
+        lavender("check", tmp_path / "p.npz", "--solvers", "auto", "--threshold", threshold)[0]
+        == code
+    )
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         ("import lavender.cli", "the command line needs click, rich: pip install click rich"),
-        ("lv.report.run(['granularF(n=3)'], ['pgs'])", "a measurement needs joblib: pip install joblib"),
-        ("lv.solve(lcp, 'pgs', history=True).history.plot()", "History.plot needs matplotlib: pip install"),
+        (
+            "lv.report.run(['granularF(n=3)'], ['pgs'])",
+            "a measurement needs joblib: pip install joblib",
+        ),
+        (
+            "lv.solve(lcp, 'pgs', history=True).history.plot()",
+            "History.plot needs matplotlib: pip install",
+        ),
         ("lv.suite; print(lv.cross_check(lcp, ['pgs', 'direct']))", "agrees"),
     ],
 )
@@ -231,7 +272,9 @@ def test_check_json_is_the_only_output(lavender, path):
 
 
 @pytest.mark.parametrize("columns", ["0", "19"])
-@pytest.mark.parametrize("words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")])
+@pytest.mark.parametrize(
+    "words", [("solvers",), ("report", "--list"), ("check", "stack(n=4)", "--solvers", "pgs")]
+)
 def test_command_in_a_narrow_terminal_prints_whole_names(lavender, monkeypatch, words, columns):
     wide = lavender(*words)[1]
     monkeypatch.setenv("COLUMNS", columns)

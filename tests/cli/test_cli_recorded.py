@@ -14,15 +14,21 @@ def make_step():
     return batch, np.tile([1.0, 0.0], (2, 1))
 
 
-@pytest.mark.parametrize("words", [("check",), ("explain",), ("doctor",), ("report", "--solvers", "pgs")])
+@pytest.mark.parametrize(
+    "words", [("check",), ("explain",), ("doctor",), ("report", "--solvers", "pgs")]
+)
 def test_folder_of_a_recorder_with_states_is_read_by_the_commands(lavender, tmp_path, words):
     with lv.io.Recorder(tmp_path / "r", every=1) as recorder:
         recorder.add(*make_step(), state={"q": np.zeros((2, 3))})
     out = ("--out", tmp_path / "o") if words[0] == "report" else ()
     code, printed, err = lavender(words[0], tmp_path / "r", *words[1:], *out)
     assert code == 0 and "states" not in printed + err
-    code, printed, err = lavender(words[0], tmp_path / "r" / "states" / recorder.files[0], *words[1:], *out)
-    assert code != 0 and "holds the state before a recorded step; its problem is" in " ".join((printed + err).split())
+    code, printed, err = lavender(
+        words[0], tmp_path / "r" / "states" / recorder.files[0], *words[1:], *out
+    )
+    assert code != 0 and "holds the state before a recorded step; its problem is" in " ".join(
+        (printed + err).split()
+    )
 
 
 def test_folder_of_an_audit_is_read_as_its_worst_problems(lavender, tmp_path):
@@ -30,7 +36,9 @@ def test_folder_of_an_audit_is_read_as_its_worst_problems(lavender, tmp_path):
         recorder.add(*make_step())
     for name in ("records.npz", "states.npz"):
         np.savez(tmp_path / name, velocity=np.zeros(3))
-    assert lavender("check", tmp_path)[0] != 0  # Not the folder of an audit: these files are not problems.
+    assert (
+        lavender("check", tmp_path)[0] != 0
+    )  # Not the folder of an audit: these files are not problems.
     (tmp_path / "numbers.json").write_text("{}")
     code, printed, err = lavender("check", tmp_path)
     assert code == 0, printed + err

@@ -61,15 +61,33 @@ def test_report_leaves_out_a_named_file_that_is_broken_and_ends_with_1(lavender,
     assert code == 1 and "nothing was measured" in out and str(broken) in out
 
 
-def test_quiet_report_prints_the_path_of_the_page_and_writes_the_chosen_figures_and_columns(lavender, path, tmp_path):
+def test_quiet_report_prints_the_path_of_the_page_and_writes_the_chosen_figures_and_columns(
+    lavender, path, tmp_path
+):
     out = tmp_path / "out"
-    words = ("report", path, "--solvers", "pgs,newton", "--tolerances", "1e-3,1e-6", "--repeats", 1, "--out", out)
-    code, shown, err = lavender(*words, "-q", "--figure-kinds", "pdf,svg", "--columns", "1e-6,solved,slowest")
+    words = (
+        "report",
+        path,
+        "--solvers",
+        "pgs,newton",
+        "--tolerances",
+        "1e-3,1e-6",
+        "--repeats",
+        1,
+        "--out",
+        out,
+    )
+    code, shown, err = lavender(
+        *words, "-q", "--figure-kinds", "pdf,svg", "--columns", "1e-6,solved,slowest"
+    )
     assert (code, shown.strip(), err) == (0, str(out / "index.html"), "")
     assert {p.suffix for p in (out / "figures").iterdir()} == {".pdf", ".svg"}
     table = (out / "tables" / "solvers.tex").read_text()
     assert r" & $10^{-6}$ & solved & slowest [ms] \\" in table and r"\toprule" in table
-    for options, sign in ((("--columns", "fastest"), "no column 'fastest'"), (("--figure-kinds", "bmp"), "bmp")):
+    for options, sign in (
+        (("--columns", "fastest"), "no column 'fastest'"),
+        (("--figure-kinds", "bmp"), "bmp"),
+    ):
         code, shown, err = lavender(*words, *options)
         assert (code, shown) == (2, "") and sign in err
 
@@ -81,11 +99,22 @@ def test_report_stopped_by_ctrl_c_keeps_records_and_writes_the_page(tmp_path):
     a = np.array([[1.0, -1.0], [-1.0, 1.0]])
     n = 300
     big = np.kron(np.eye(n), a) + 1e-9 * np.eye(2 * n)
-    io.save(lv.Problem.lcp(big, np.random.default_rng(0).standard_normal(2 * n)), tmp_path / "hard.npz")
+    io.save(
+        lv.Problem.lcp(big, np.random.default_rng(0).standard_normal(2 * n)), tmp_path / "hard.npz"
+    )
     io.save(stack(8), tmp_path / "easy.npz")
-    command = [sys.executable, "-m", "lavender.cli", "report", tmp_path / "easy.npz", tmp_path / "hard.npz"]
+    command = [
+        sys.executable,
+        "-m",
+        "lavender.cli",
+        "report",
+        tmp_path / "easy.npz",
+        tmp_path / "hard.npz",
+    ]
     command += ["--solvers", "pgs,jacobi", "--time-limit", "60", "--no-figures", "--out", out]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
     records = out / "records.jsonl"
     while not (records.exists() and '"case": "hard"' in records.read_text()):
         assert process.poll() is None
@@ -106,7 +135,16 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert code == 0
     assert "4 problems" in out
     assert len(list(folder.glob("*.npz"))) == 4
-    words = ("report", folder, "--solvers", "sequential_impulses", "--budgets", "4", "--tolerances", "1e-1")
+    words = (
+        "report",
+        folder,
+        "--solvers",
+        "sequential_impulses",
+        "--budgets",
+        "4",
+        "--tolerances",
+        "1e-1",
+    )
     code, out, _ = lavender(*words, "--no-figures", "--repeats", 1)
     assert code == 0
     assert "it solves all 4 steps of steps, in" in out
@@ -156,7 +194,9 @@ def test_report_counts_steps_that_were_not_recorded(lavender, tmp_path, monkeypa
         assert skips[["sequence", "solver"]].to_numpy().tolist() == [[name, ""]] * 3
     assert lavender("report", tmp_path / "o" / "records.jsonl", *shown)[0] == 0  # shown again
     (folder,) = (tmp_path / "o" / "recorded").iterdir()
-    code, out, _ = lavender("report", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c")
+    code, out, _ = lavender(
+        "report", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
+    )
     assert code == cli.EXIT_UNMET and "left out, the first of 3: " in out
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     monkeypatch.setattr(recording.adapter, "from_mujoco", true)

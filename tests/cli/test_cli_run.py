@@ -18,22 +18,45 @@ from lavender.sim.web import pages
 
 @pytest.mark.parametrize(
     "asked",
-    [("--iterations", "8", "--no-warm-start"), ("--set", "solver_iterations=8", "--set", "warm_start=false")],
+    [
+        ("--iterations", "8", "--no-warm-start"),
+        ("--set", "solver_iterations=8", "--set", "warm_start=false"),
+    ],
     ids=["options", "set"],
 )
 def test_run_command_writes_the_requested_files(lavender, tmp_path, asked):
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
-    words = ["run", "stack", *asked, "--steps", "12", "--set", "n=2", "--order", "top_down", "--residual"]
+    words = [
+        "run",
+        "stack",
+        *asked,
+        "--steps",
+        "12",
+        "--set",
+        "n=2",
+        "--order",
+        "top_down",
+        "--residual",
+    ]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2]]
     code, printed, _ = lavender(*words, *files)
     assert not code
-    assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
+    assert (
+        "step     12" in printed
+        and "contacts     8  matches     0" in printed
+        and "worst" in printed
+    )
     assert "order top_down" in printed.splitlines()[-1]
     table = np.genfromtxt(paths[0], delimiter=",", names=True, dtype=None, encoding="utf-8")
-    assert table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
+    assert (
+        table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
+    )
     assert table["residual_final"].max() < table["residual_initial"].max()
     assert set(table["order"]) == {"top_down"}
-    assert paths[1].read_text().lstrip().startswith("<?xml") and "order top_down" in paths[1].read_text()
+    assert (
+        paths[1].read_text().lstrip().startswith("<?xml")
+        and "order top_down" in paths[1].read_text()
+    )
     assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == 12 * [8]
 
 
@@ -66,7 +89,9 @@ def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path):
     code, out, _ = lavender("run", "stack", "--steps", "50", *files)
     assert code == 130 and "5 steps" in out and "Stopped" in out
     rows = pd.read_csv(trace)
-    np.testing.assert_allclose(rows["time"] / rows["step"], rows["time"][0], rtol=1e-9)  # of the state after a step
+    np.testing.assert_allclose(
+        rows["time"] / rows["step"], rows["time"][0], rtol=1e-9
+    )  # of the state after a step
     assert rows["step"].tolist() == [1, 2, 3, 4, 5] and film.stat().st_size
     assert len(list(problems.iterdir())) >= 5
     monkeypatch.setattr(Simulation, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -109,7 +134,9 @@ def test_command_writes_a_page_without_outside_addresses(lavender, module, tmp_p
     pytest.importorskip("Cython", reason="the command translates the kernels (extra: test)")
     assert lavender("web", "page", tmp_path / "site")[0] == 0
     files = {
-        path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*") if path.is_file()
+        path.relative_to(tmp_path / "site").as_posix()
+        for path in (tmp_path / "site").rglob("*")
+        if path.is_file()
     }
     assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
     assert {"lavender.wasm", "newton.wasm"} <= files
@@ -117,4 +144,6 @@ def test_command_writes_a_page_without_outside_addresses(lavender, module, tmp_p
     for name in sorted(files):
         if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
             text = (tmp_path / "site" / name).read_text(encoding="utf-8")
-            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
+            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, (
+                name
+            )

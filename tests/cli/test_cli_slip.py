@@ -15,7 +15,9 @@ def test_slip_command_prints_the_cause(lavender, tmp_path):
     code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15)
     assert code == 0, error
     assert "slope, box" in output and "sliding at the friction limit" in output
-    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15, "--contact", "hand")
+    code, output, error = lavender(
+        "slip", tmp_path / "slope.xml", "--steps", 15, "--contact", "hand"
+    )
     assert code == 2 and "hand" in error
 
 
@@ -25,8 +27,12 @@ def test_slip_command_on_a_geom_without_contact_ends_with_1(lavender, tmp_path):
     assert code == 1 and "'box' touches nothing with friction in these states." in output
 
 
-@pytest.mark.parametrize("command", [("slip", "--steps", 15), ("audit", "--worlds", 1, "--steps", 5)])
-def test_command_makes_the_folders_of_its_page_and_rejects_a_file_in_their_place(command, lavender, tmp_path):
+@pytest.mark.parametrize(
+    "command", [("slip", "--steps", 15), ("audit", "--worlds", 1, "--steps", 5)]
+)
+def test_command_makes_the_folders_of_its_page_and_rejects_a_file_in_their_place(
+    command, lavender, tmp_path
+):
     model = tmp_path / "slope.xml"
     page = tmp_path / "new" / "of" / "page"
     model.write_text(SLOPE)

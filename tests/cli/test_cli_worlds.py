@@ -14,7 +14,18 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contac
 
 
 def test_audit_command_exit_code_follows_the_error_limit(lavender, boxes, tmp_path):
-    words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--max-velocity-error", "1e-3")
+    words = (
+        "--worlds",
+        2,
+        "--steps",
+        20,
+        "--workers",
+        1,
+        "--out",
+        tmp_path / "out",
+        "--max-velocity-error",
+        "1e-3",
+    )
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
     page = (tmp_path / "out" / "index.html").read_text()
@@ -28,7 +39,9 @@ def test_audit_command_exit_code_follows_the_error_limit(lavender, boxes, tmp_pa
     assert 0 < above == told["above_limit"] and told["error_limit"] == 1e-3
     code, out, _ = lavender("audit", boxes(), *words)
     assert code == 0 and "No step is wrong beyond rounding" in out
-    assert json.loads((tmp_path / "out-1" / "numbers.json").read_text()) == told  # The earlier audit was moved aside.
+    assert (
+        json.loads((tmp_path / "out-1" / "numbers.json").read_text()) == told
+    )  # The earlier audit was moved aside.
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # files of another run are gone
 
 
@@ -45,18 +58,33 @@ def test_states_that_an_audit_saves_are_read_by_the_other_commands(lavender, box
     assert code == 2 and "'best' is not one of 'contact', 'worst'" in err
 
 
-def test_a_model_changed_after_loading_is_read_as_mjb_by_each_command(lavender, boxes, tmp_path, monkeypatch):
+def test_a_model_changed_after_loading_is_read_as_mjb_by_each_command(
+    lavender, boxes, tmp_path, monkeypatch
+):
     keep_values(monkeypatch, tuning, "MUJOCO", {3}, {"CG"})
     mujoco = pytest.importorskip("mujoco")
     model = mujoco.MjModel.from_xml_path(str(boxes(EARLY)))
     model.geom_friction[:] = 0.02
     mujoco.mj_saveModel(model, str(tmp_path / "changed.mjb"))
     words = ("--steps", 20, "--out", tmp_path / "out")
-    assert lavender("audit", tmp_path / "changed.mjb", "--worlds", 1, "--workers", 1, *words)[0] == 0
+    assert (
+        lavender("audit", tmp_path / "changed.mjb", "--worlds", 1, "--workers", 1, *words)[0] == 0
+    )
     assert lavender("tune", tmp_path / "changed.mjb", "--worlds", 2, "--repeats", 1, *words)[0] == 0
     assert lavender("slip", tmp_path / "changed.mjb", "--steps", 20)[0] == 0
-    assert lavender("record", tmp_path / "changed.mjb", "--steps", 20, "--out", tmp_path / "steps")[0] == 0
+    assert (
+        lavender("record", tmp_path / "changed.mjb", "--steps", 20, "--out", tmp_path / "steps")[0]
+        == 0
+    )
     recorded = lv.load(next((tmp_path / "steps").glob("step_*.npz")))
     assert recorded.m > 0
-    report = ("report", tmp_path / "changed.mjb", "--steps", 10, "--solvers", "newton", "--no-figures")
+    report = (
+        "report",
+        tmp_path / "changed.mjb",
+        "--steps",
+        10,
+        "--solvers",
+        "newton",
+        "--no-figures",
+    )
     assert lavender(*report, "--out", tmp_path / "page")[0] == 0

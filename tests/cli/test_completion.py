@@ -20,7 +20,9 @@ HAS_ALL_NAMES = {
 
 def complete(words, incomplete):
     """Return the items that a shell shows for a command line whose last word is `incomplete`."""
-    return ShellComplete(cli, {}, "lavender", "_LAVENDER_COMPLETE").get_completions(words, incomplete)
+    return ShellComplete(cli, {}, "lavender", "_LAVENDER_COMPLETE").get_completions(
+        words, incomplete
+    )
 
 
 @pytest.mark.parametrize("line", HAS_ALL_NAMES)

@@ -9,7 +9,18 @@ from click.testing import CliRunner
 from lavender.cli.entry import cli
 from lavender.report import doctor, machine
 
-NEEDED = {"lavender", "python", "platform", "cpu", "cores", "versions", "build", "backends", "self_test", "same_bits"}
+NEEDED = {
+    "lavender",
+    "python",
+    "platform",
+    "cpu",
+    "cores",
+    "versions",
+    "build",
+    "backends",
+    "self_test",
+    "same_bits",
+}
 
 
 def test_doctor_prints_versions_and_confirms_bits():
@@ -22,7 +33,9 @@ def test_doctor_prints_versions_and_confirms_bits():
     assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
     facts = machine.describe_run({})["build"]
     assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
-    assert {k: found["build"][k] for k in facts if k != "clock"} == {k: facts[k] for k in facts if k != "clock"}
+    assert {k: found["build"][k] for k in facts if k != "clock"} == {
+        k: facts[k] for k in facts if k != "clock"
+    }
 
 
 def test_doctor_with_a_changed_bit_ends_with_1(monkeypatch):

@@ -10,7 +10,9 @@ import lavender as lv
 from lavender import cli
 
 COMMANDS_PAGE = Path(__file__).resolve().parents[2] / "docs" / "commands.md"
-AIR = '<mujoco><worldbody><body><freejoint/><geom size="1" friction="1"/></body></worldbody></mujoco>'
+AIR = (
+    '<mujoco><worldbody><body><freejoint/><geom size="1" friction="1"/></body></worldbody></mujoco>'
+)
 #: (code, command). FOLDER contains an unreadable file; AIR is a model of MuJoCo whose body touches nothing.
 ENDS = [
     (0, "solve PROBLEM"),
@@ -28,7 +30,10 @@ ENDS = [
     (1, "explain FOLDER"),
     (2, "explain nothing.npz"),
     (0, "report PROBLEM --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
-    (0, "report PROBLEM --solvers pgs --tolerances 1e-12 --time-limit 1e-9 --budgets 2 --repeats 1 --no-figures"),
+    (
+        0,
+        "report PROBLEM --solvers pgs --tolerances 1e-12 --time-limit 1e-9 --budgets 2 --repeats 1 --no-figures",
+    ),
     (1, "report FOLDER --solvers pgs --tolerances 1e-3 --budgets 2 --repeats 1 --no-figures"),
     (2, "report nothing.npz"),
     (0, "doctor PROBLEM"),
@@ -92,11 +97,15 @@ def run_line(lavender, tmp_path):
 
 
 def test_documented_exit_codes_equal_the_package():
-    rows = re.findall(r"^\| (\d+) \| (.*) \|$", COMMANDS_PAGE.read_text().partition("## Exit codes")[2], re.M)
+    rows = re.findall(
+        r"^\| (\d+) \| (.*) \|$", COMMANDS_PAGE.read_text().partition("## Exit codes")[2], re.M
+    )
     assert {int(code): meaning for code, meaning in rows} == cli.EXIT_CODES
 
 
-@pytest.mark.parametrize(("code", "words"), ENDS, ids=[f"{words} is {code}" for code, words in ENDS])
+@pytest.mark.parametrize(
+    ("code", "words"), ENDS, ids=[f"{words} is {code}" for code, words in ENDS]
+)
 def test_command_ends_with_its_documented_code(run_line, code, words):
     ended, out, err = run_line(words)
     assert ended == code, out + err

@@ -46,7 +46,14 @@ NEEDED = {
     "run stack --steps 2": set(),
     "solvers": {"pandas", "rich"},
     "record box.xml --record-every 1 --steps 2 --out recorded": {"mujoco", "scipy"},
-    "audit box.xml --worlds 2 --steps 3 --out audited": {"mujoco", "pandas", "jinja2", "matplotlib", "rich", "joblib"},
+    "audit box.xml --worlds 2 --steps 3 --out audited": {
+        "mujoco",
+        "pandas",
+        "jinja2",
+        "matplotlib",
+        "rich",
+        "joblib",
+    },
 }
 
 
@@ -57,7 +64,11 @@ def loaded_by(commands, folder):
 def test_help_of_every_command_loads_click_and_numpy_only(tmp_path):
     """Modules with an underscore belong to Python's site packages or to Cython's runtime."""
     words = [["--help"], *([name, "--help"] for name in cli.list_commands(None))]
-    foreign = {name for name in loaded_by(words, tmp_path) if not name.startswith("_") and name != "cython_runtime"}
+    foreign = {
+        name
+        for name in loaded_by(words, tmp_path)
+        if not name.startswith("_") and name != "cython_runtime"
+    }
     assert foreign - {"cmeel_pth"} == {"click", "numpy", "lavender", "lavender_ext"}
 
 

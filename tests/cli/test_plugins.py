@@ -79,7 +79,9 @@ def test_solvers_of_a_plug_in_names_its_package_and_version(install):
     assert done.stderr == "" and "Plug-in of: many-solvers 1.2" in done.stdout
 
 
-def test_report_with_a_plug_in_that_ends_the_process_keeps_its_rows_and_continues(install, tmp_path):
+def test_report_with_a_plug_in_that_ends_the_process_keeps_its_rows_and_continues(
+    install, tmp_path
+):
     environment = install("good = plugin_module:GOOD", "other = plugin_module:OTHER")
     words = ("report", "toy_stack", "--repeats", "1", "--no-figures", "--out", str(tmp_path / "o"))
     words += ("--solvers", "direct,pgs,good")

@@ -19,7 +19,9 @@ from lavender.sim.engine import run
 from lavender.sim.engine.picture import Film
 
 resource = pytest.importorskip("resource", reason="limits of files are of POSIX")
-needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
+needs_hdf5 = pytest.mark.skipif(
+    find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)"
+)
 BEFORE = b"the content before"
 
 
@@ -66,7 +68,9 @@ def file_size_limit(size):
 def test_write_over_a_pipe_or_a_folder_is_an_error_and_through_a_link_replaces_its_target(
     suffix, call, results, tmp_path
 ):
-    pipe, folder, target, link = (tmp_path / f"{name}{suffix}" for name in ("pipe", "folder", "target", "link"))
+    pipe, folder, target, link = (
+        tmp_path / f"{name}{suffix}" for name in ("pipe", "folder", "target", "link")
+    )
     os.mkfifo(pipe)
     folder.mkdir()
     target.write_bytes(BEFORE)
@@ -81,7 +85,9 @@ def test_write_over_a_pipe_or_a_folder_is_an_error_and_through_a_link_replaces_i
 
 @each_writer
 @pytest.mark.parametrize("is_renamed", [False, True], ids=["writing", "renaming"])
-def test_write_on_a_full_disk_keeps_the_old_file(is_renamed, suffix, call, results, tmp_path, monkeypatch):
+def test_write_on_a_full_disk_keeps_the_old_file(
+    is_renamed, suffix, call, results, tmp_path, monkeypatch
+):
     path = tmp_path / f"there{suffix}"
     path.write_bytes(BEFORE)
 
@@ -112,7 +118,10 @@ def test_store_on_a_full_disk_raises_and_keeps_the_earlier_rows(tmp_path):
     with Store(path) as store:
         store.add(row)
         size = path.stat().st_size
-        with file_size_limit(size), pytest.raises(lv.InputError, match=r"cannot write .* free disk space"):
+        with (
+            file_size_limit(size),
+            pytest.raises(lv.InputError, match=r"cannot write .* free disk space"),
+        ):
             store.add(row)
     assert len(report.read(path)) >= 1  # The second line may be flushed when the file is closed.
 

@@ -80,13 +80,21 @@ def solve_after_a_residual(problem, name, **options):
 
 #: Ways to solve a problem of which nothing was derived before.
 WAYS = {
-    "a pickled problem": lambda p, name, **more: lv.solve(pickle.loads(pickle.dumps(p)), name, **more),
+    "a pickled problem": lambda p, name, **more: lv.solve(
+        pickle.loads(pickle.dumps(p)), name, **more
+    ),
     "judged before": solve_after_a_residual,
     "one of a list": lambda p, name, **more: lv.solve_many([p], name, **more)[0],
-    "a list and two threads": lambda p, name, **more: lv.solve_many([p] * 3, name, threads=2, **more)[2],
+    "a list and two threads": lambda p, name, **more: lv.solve_many(
+        [p] * 3, name, threads=2, **more
+    )[2],
     "eight threads": solve_in_eight_threads,
-    "a time limit that does not bind": lambda p, name, **more: lv.solve(p, name, time_limit=600.0, **more),
-    "a list and a time limit": lambda p, name, **more: lv.solve_many([p], name, time_limit=600.0, **more)[0],
+    "a time limit that does not bind": lambda p, name, **more: lv.solve(
+        p, name, time_limit=600.0, **more
+    ),
+    "a list and a time limit": lambda p, name, **more: lv.solve_many(
+        [p], name, time_limit=600.0, **more
+    )[0],
     "a callback": solve_with_a_callback,
 }
 
@@ -197,9 +205,16 @@ def alternating_islands():
         half = rng.normal(size=(2, 7, 7))
         first = np.repeat(np.arange(cones.n_blocks) % 2 == 0, np.diff(cones.ptr))
         jac[first, 7:] = jac[~first, :7] = 0.0
-        mass = np.kron(np.eye(2), np.ones((7, 7))) * np.tile(np.hstack(half @ half.swapaxes(1, 2)), (2, 1))
+        mass = np.kron(np.eye(2), np.ones((7, 7))) * np.tile(
+            np.hstack(half @ half.swapaxes(1, 2)), (2, 1)
+        )
         yield lv.Problem.from_jacobian(
-            jac, mass + np.eye(14), rng.normal(size=14), cones=cones, compliance=compliance, friction="cone"
+            jac,
+            mass + np.eye(14),
+            rng.normal(size=14),
+            cones=cones,
+            compliance=compliance,
+            friction="cone",
         )
 
 
@@ -218,7 +233,12 @@ RUNS = {
         for tol in (0.0, 1e-14)
     },
     **{
-        f"{name} until it stalls": (functools.partial(run_solver, name=name, tol=1e-6), opposed, [1000], [7])
+        f"{name} until it stalls": (
+            functools.partial(run_solver, name=name, tol=1e-6),
+            opposed,
+            [1000],
+            [7],
+        )
         for name in RESUMABLE
     },
     "newton": (functools.partial(run_solver, name="newton"), examples, [1000], [2]),

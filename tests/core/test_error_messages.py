@@ -12,7 +12,12 @@ import pytest
 import scipy.sparse as sp
 from approved_texts import check_text
 from gradient_problems import drawn
-from random_problems import as_matrix, dragged, random_bodies_and_contacts, random_generalized_problem
+from random_problems import (
+    as_matrix,
+    dragged,
+    random_bodies_and_contacts,
+    random_generalized_problem,
+)
 
 import lavender as lv
 from lavender.problem.ordering import compute_block_order
@@ -42,7 +47,9 @@ def two():
 
 def two_rows(jac=(1.0, 1.0), mass=(1.0, 1.0), v_free=(1.0, 1.0), **more):
     """Build two rows on two velocities that nothing couples."""
-    return lv.Problem.from_jacobian(np.diag(jac), np.diag(mass), v_free, cones=lv.Cones.free(2), **more)
+    return lv.Problem.from_jacobian(
+        np.diag(jac), np.diag(mass), v_free, cones=lv.Cones.free(2), **more
+    )
 
 
 def shortened():
@@ -53,13 +60,17 @@ def shortened():
 
 
 def rows_with(**changes):
-    return lv.Rows(**{f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"} | changes)
+    return lv.Rows(
+        **{f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"} | changes
+    )
 
 
 def late_batch(jac):
     """Build worlds of one row whose A_ii is the square of `jac`."""
     ones = np.ones((3, 1))
-    return lv.Batch(np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * ones, target=ones, cones=lv.Cones.free(1))
+    return lv.Batch(
+        np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * ones, target=ones, cones=lv.Cones.free(1)
+    )
 
 
 def solved_builder():
@@ -113,7 +124,9 @@ ERRORS = {
         lambda: findex([0, -1, -1], [5, 1, 1], [-1, 0, 0]),
         lambda: findex([-1, -1, -1], [INF, 1, 1], [-1, 0, 0]),
         lambda: findex([0, -1], [INF, 1], [-1, 0, 0]),
-        lambda: lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [INF, 1, 1, 1], [-1, 0, 0, 0]),
+        lambda: lv.Problem.from_findex(
+            np.eye(4), np.ones(4), [0, -1, -1, -1], [INF, 1, 1, 1], [-1, 0, 0, 0]
+        ),
         lambda: CONTACT.to_findex(),
         lambda: box(friction="cone").to_findex(),
         lambda: dragged(0, 3).to_findex(),
@@ -126,7 +139,10 @@ ERRORS = {
         lambda: lv.Generalized(np.ones((1, 2)), A, np.zeros(2), ["hip"]),
         lambda: lv.Problem.from_jacobian(np.ones((1, 2)), A, np.zeros(2), cones=lv.Cones.free(2)),
         lambda: lv.Problem(
-            np.zeros(1), lv.Cones.free(1), np.eye(1), generalized=lv.Generalized(np.ones((1, 2)), A, np.zeros(2))
+            np.zeros(1),
+            lv.Cones.free(1),
+            np.eye(1),
+            generalized=lv.Generalized(np.ones((1, 2)), A, np.zeros(2)),
         ),
         lambda: GENERAL.updated(J=GENERAL.generalized.jac),
         lambda: GENERAL.updated(b=GENERAL.b, target=0.0),
@@ -134,9 +150,16 @@ ERRORS = {
         lambda: GENERAL.updated(J=GENERAL.generalized.jac[:, 1:], target=0.0),
         *(
             partial(lv.Problem, np.ones(2), lv.Cones.free(2), **given)
-            for given in ({"generalized": 3}, {"rows": 3}, {"generalized": GENERAL.generalized}, {"rows": ROWS})
+            for given in (
+                {"generalized": 3},
+                {"rows": 3},
+                {"generalized": GENERAL.generalized},
+                {"rows": ROWS},
+            )
         ),
-        lambda: lv.Batch(np.ones((1, 4, 4)), np.eye(4)[None], np.ones((1, 4)), cones=contacts(0.5, 3)),
+        lambda: lv.Batch(
+            np.ones((1, 4, 4)), np.eye(4)[None], np.ones((1, 4)), cones=contacts(0.5, 3)
+        ),
         lambda: lv.Batch(
             np.ones((4, 2)),
             np.array([I2, I2]),
@@ -159,7 +182,10 @@ ERRORS = {
         lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0),
         lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]),
         lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]),
-        *(partial(lv.Problem.contact, I3, np.ones(3), [1], friction=law) for law in ("couloumb", np.array([0.5, 0.5]))),
+        *(
+            partial(lv.Problem.contact, I3, np.ones(3), [1], friction=law)
+            for law in ("couloumb", np.array([0.5, 0.5]))
+        ),
         lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]),
         lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]),
         lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]),
@@ -182,7 +208,10 @@ ERRORS = {
                 {"contact_body": np.full((8, 2), [3, 3])},
                 {"inv_mass": -np.ones(5)},
                 {"normal": np.tile([0, 0, 2.0], (8, 1))},
-                {"normal": np.tile([1e60, 1e60, 0], (8, 1)), "tangent": np.tile([1e60, -1e60, 0], (8, 1))},
+                {
+                    "normal": np.tile([1e60, 1e60, 0], (8, 1)),
+                    "tangent": np.tile([1e60, -1e60, 0], (8, 1)),
+                },
                 {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
             )
         ),
@@ -201,8 +230,12 @@ ERRORS = {
         lambda: BUILDER.rows_of(3),
         *(partial(two().contact, a, b, (0.0, 0.0), (0.0, 1.0)) for a, b in ((0, 0), (-1, None))),
         lambda: two().contact(0, 1, (0.0, 0.0), (0.0, 1.0), name=3),
-        lambda: [builder.contact(0, 1, (0.0, 0.0), (0.0, 1.0), feature=2) for builder in [two()] * 2],
-        lambda: two().contacts([(0, 1)] * 2, PLANE[:, :2], np.tile([0.0, 1.0], (2, 1)), feature=[2, 2]),
+        lambda: [
+            builder.contact(0, 1, (0.0, 0.0), (0.0, 1.0), feature=2) for builder in [two()] * 2
+        ],
+        lambda: two().contacts(
+            [(0, 1)] * 2, PLANE[:, :2], np.tile([0.0, 1.0], (2, 1)), feature=[2, 2]
+        ),
         lambda: BUILDER.problem("pyramid"),
         lambda: lv.solve(BUILDER),
         *(
@@ -217,7 +250,11 @@ ERRORS = {
         lambda: lv.solve(LCP, "pgs", B),
         *(
             partial(build, matrix, B[:1])
-            for build in (lv.Problem.lcp, lv.Problem.linear, lambda a, b: lv.Problem.contact(a, b, 0.0))
+            for build in (
+                lv.Problem.lcp,
+                lv.Problem.linear,
+                lambda a, b: lv.Problem.contact(a, b, 0.0),
+            )
             for matrix in (A, A.tolist())
         ),
         lambda: lv.solve(LCP, B),
@@ -265,7 +302,10 @@ ERRORS = {
         lambda: lv.derivative(CONTACT, 0.99 * lv.solve(CONTACT, tol=1e-12).impulse),
         lambda: lv.derivative(CONTACT.updated(b=[9.0, 6.0, 0.0]), lv.solve(CONTACT, tol=1e-12)),
         lambda: lv.derivative(LCP, lv.solve(CONTACT)),
-        *(partial(lv.register, replace(lv.get("pgs"), name=name)) for name in ("my solver", "a\nb")),
+        *(
+            partial(lv.register, replace(lv.get("pgs"), name=name))
+            for name in ("my solver", "a\nb")
+        ),
         lambda: lv.Scene(friction=1e-61),
         lambda: lv.Scene(gravity=1e61),
         lambda: lv.Scene().add_box(mass=1e-61),
@@ -279,7 +319,9 @@ ERRORS = {
         lambda: lv.Problem.contact(I3, np.ones(3), mu=[0.5] * 3),
         lambda: lv.solve_qp(lv.Problem.from_qp(A, B), lb=B),
         lambda: lv.solve_qp(lv.Problem.from_qp(A, B, G=[[1.0, 2.0]], h=[-INF]), h=[1.0]),
-        lambda: lv.derivatives([P] * 2, [ANSWER] * 2).vjp(velocity=np.full((2, P.generalized.nv), [[0.0], [np.nan]])),
+        lambda: lv.derivatives([P] * 2, [ANSWER] * 2).vjp(
+            velocity=np.full((2, P.generalized.nv), [[0.0], [np.nan]])
+        ),
         lambda: lv.derivatives([P] * 2, lv.solve_many([LCP] * 2)),
         lambda: replace(two_rows(), angular=[0.5, 1.0]),
         lambda: FOUND.plot(rows=0),

@@ -64,7 +64,9 @@ def solve_cases(draw):
     options["max_iter"] = draw(st.sampled_from((1, 2, 20, 50, 200, spec.max_iter)))
     start = draw(st.sampled_from(STARTS))
     if start != "none":
-        numbers = rng.normal(size=problem.m) if start == "finite" else rng.choice(SPECIAL, problem.m)
+        numbers = (
+            rng.normal(size=problem.m) if start == "finite" else rng.choice(SPECIAL, problem.m)
+        )
         options["impulse"] = numbers.tolist()
     if spec.order and draw(st.booleans()):
         options["order"] = draw(st.sampled_from(ORDERS))
@@ -73,7 +75,9 @@ def solve_cases(draw):
     if draw(st.integers(0, 49)) == 49:
         options["time_limit"] = draw(st.sampled_from((0.0, 1e-6, 1e-3, 1.0)))
     case = {"problem": data, "solver": name, "options": options}
-    if not spec.external and "time_limit" not in options:  # Repeating others' solvers is their own affair.
+    if (
+        not spec.external and "time_limit" not in options
+    ):  # Repeating others' solvers is their own affair.
         how = draw(st.sampled_from(("once", "once", "again", "prepared", "many")))
         case |= {"again": how == "again", "prepared": how == "prepared"}
         if how == "many":
@@ -101,10 +105,27 @@ def hash_of(problem):
     """Return a hash of everything that a solver could have changed."""
     digest = hashlib.sha256()
     c = problem.cones
-    arrays = [problem.b, problem.d, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius, c.rolling]
-    matrices = [problem.csr] if problem.generalized is None else [problem.jacobian, problem.generalized.mass]
+    arrays = [
+        problem.b,
+        problem.d,
+        problem.guess,
+        c.ptr,
+        c.kind,
+        c.lower,
+        c.upper,
+        c.mu,
+        c.patch_radius,
+        c.rolling,
+    ]
+    matrices = (
+        [problem.csr]
+        if problem.generalized is None
+        else [problem.jacobian, problem.generalized.mass]
+    )
     for matrix in matrices:
-        arrays += [matrix.indptr, matrix.indices, matrix.data] if hasattr(matrix, "indptr") else [matrix]
+        arrays += (
+            [matrix.indptr, matrix.indices, matrix.data] if hasattr(matrix, "indptr") else [matrix]
+        )
     for x in arrays:
         digest.update(b"" if x is None else np.ascontiguousarray(x).tobytes())
     return digest.digest()
@@ -149,7 +170,9 @@ def check_many(case, problem, solution):
             continue  # Its numbers are out of range.
     problems = [problem, *(other for _, other in others)]
     starts = None if start is None else [start] * len(problems)
-    solutions = lv.solve_many(problems, case["solver"], impulses=starts, threads=case["threads"], **options)
+    solutions = lv.solve_many(
+        problems, case["solver"], impulses=starts, threads=case["threads"], **options
+    )
     assert bits(solutions[0]) == bits(solution)
     for (b, other), one in zip(others, solutions[1:], strict=True):
         assert bits(lv.solve(other, case["solver"], **case["options"])) == bits(one)
@@ -169,7 +192,10 @@ def check_claims(data, problem, solution, options):
         assert solution.iterations == budget
     is_finite = bool(np.isfinite(solution.impulse).all())
     assert is_finite or status in ("DIVERGED", "NUMERICAL_ERROR")
-    assert not any(math.isnan(getattr(r, name)) for name in ("relative", "energy", "velocity", "roundoff_floor"))
+    assert not any(
+        math.isnan(getattr(r, name))
+        for name in ("relative", "energy", "velocity", "roundoff_floor")
+    )
     try:
         solution.raise_for_status()
         accepted = True
@@ -183,24 +209,41 @@ def check_claims(data, problem, solution, options):
     if j.nothing or twin.d_edge or twin.of_factor > ILL_CONDITIONED:
         return
     slop = 1.0 + 1e-6
-    unrefined = min(j.unrefined, 0.1 * max(solution.tol, j.relative))  # A pass of this accuracy is not refined.
+    unrefined = min(
+        j.unrefined, 0.1 * max(solution.tol, j.relative)
+    )  # A pass of this accuracy is not refined.
     within = solution.tol * slop + j.allowed + unrefined
-    floor = 2.0 * max(j.roundoff_floor, min(r.roundoff_floor, j.floor_most)) * slop + j.allowed + unrefined
+    floor = (
+        2.0 * max(j.roundoff_floor, min(r.roundoff_floor, j.floor_most)) * slop
+        + j.allowed
+        + unrefined
+    )
     confirmed = solution.claim_check == "confirmed"
-    numbers = f"relative {r.relative:.3e}, floor {r.roundoff_floor:.3e}, in long double {j.relative:.3e}"
+    numbers = (
+        f"relative {r.relative:.3e}, floor {r.roundoff_floor:.3e}, in long double {j.relative:.3e}"
+    )
     if solution.success or (status == "CONVERGED" and confirmed):
         assert j.relative <= within, numbers
     if (status == "ROUNDOFF_LIMIT" and confirmed) or accepted:
         assert j.relative <= max(within, floor), numbers
     if status == "ROUNDOFF_LIMIT" or (accepted and not solution.success):
         # Of rows with b = 0 in an island that nothing else acts on, the floor has no scale.
-        assert r.relative <= 1e-5 and (math.isfinite(r.roundoff_floor) or r.relative == 0.0), numbers
+        assert r.relative <= 1e-5 and (math.isfinite(r.roundoff_floor) or r.relative == 0.0), (
+            numbers
+        )
     # A judge that reports a floor above 1e-5 accepts nothing: it says that float64 cannot measure this impulse.
     if is_finite and j.range < MODERATE and not r.relative <= r.roundoff_floor > 1e-5:
-        both_infinite = r.relative == j.relative == math.inf  # Zero impulses solve the problem, these do not.
-        assert both_infinite or abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + unrefined, numbers
+        both_infinite = (
+            r.relative == j.relative == math.inf
+        )  # Zero impulses solve the problem, these do not.
+        assert (
+            both_infinite
+            or abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + unrefined
+        ), numbers
         d = np.array(twin.d, float)
-        rounding = 1e-6 + float(twin.of_factor) * 2.0**-53  # The second term is that of the factor of M.
+        rounding = (
+            1e-6 + float(twin.of_factor) * 2.0**-53
+        )  # The second term is that of the factor of M.
         assert abs(problem.disk.d - d).max(initial=0.0) <= rounding * d.max(initial=0.0)
 
 
@@ -231,7 +274,9 @@ def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent)
             continue
         error = lv.motion_error(problem, impulse)
         values = {name: getattr(error, name) for name in MEASURES}
-        assert [name for name, value in values.items() if value is not None and not np.isfinite(value)] == []
+        assert [
+            name for name, value in values.items() if value is not None and not np.isfinite(value)
+        ] == []
         assert error.relative is None or np.isfinite(error.relative) or error.note
         assert str(error)
     if problem.m and problem.is_symmetric:
@@ -239,7 +284,10 @@ def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent)
         assert 0 <= result.rank == problem.m - len(result.rows)
 
 
-FOUND = [json.loads(line) for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()]
+FOUND = [
+    json.loads(line)
+    for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()
+]
 
 
 @pytest.mark.filterwarnings("error")
@@ -253,11 +301,19 @@ def check_hostile_solves(first, last):
     for seed in range(first, last):
         problem = draw_problem(seed)
         rng = np.random.default_rng(seed)
-        name = str(rng.choice([n for n in lv.available(problem) if lv.get(n).builtin and not lv.get(n).external]))
+        name = str(
+            rng.choice(
+                [n for n in lv.available(problem) if lv.get(n).builtin and not lv.get(n).external]
+            )
+        )
         options = {"tol": float(rng.choice([1e-3, 1e-6, 1e-9, 1e-12]))}
         if rng.random() < 0.3:
             options["max_iter"] = int(rng.integers(1, 60))
-        start = None if rng.random() < 0.6 else rng.choice([1e-3, 1.0, 1e3]) * rng.standard_normal(problem.m)
+        start = (
+            None
+            if rng.random() < 0.6
+            else rng.choice([1e-3, 1.0, 1e3]) * rng.standard_normal(problem.m)
+        )
         try:
             solution = lv.solve(problem, name, impulse=start, **options)
             check_claims(plain_data(problem), problem, solution, options)

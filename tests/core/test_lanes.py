@@ -7,7 +7,15 @@ from random_problems import ancestors, tree_mass
 import lavender as lv
 from lavender.batch.data import Batch
 
-NUMBERS = "relative", "energy", "velocity_error", "impulse_error", "roundoff_floor", "velocity_at_zero", "worst_row"
+NUMBERS = (
+    "relative",
+    "energy",
+    "velocity_error",
+    "impulse_error",
+    "roundoff_floor",
+    "velocity_at_zero",
+    "worst_row",
+)
 SIZES = [(3, 6, 5), (12, 18, 21), (18, 9, 10), (30, 36, 9), (15, 1, 9)]
 
 
@@ -23,10 +31,15 @@ def make_batch(contacts, nv, n, law, seed=0):
     mass[1, nv - 1, 0] = mass[1, 0, nv - 1] = float(nv == 1)
     target[2] = np.tile([-1e3, 0.0, 0.0], contacts)
     jac[3, :, nv // 2 :] *= 1e-6
-    compliance, mu = rng.choice([0.0, 1e-3, 0.1], (n, m)), rng.choice([0.0, 0.3, 1.0], (n, contacts))
+    compliance, mu = (
+        rng.choice([0.0, 1e-3, 0.1], (n, m)),
+        rng.choice([0.0, 0.3, 1.0], (n, contacts)),
+    )
     cones = lv.Cones.contacts(0.6, count=contacts)
     free = rng.standard_normal((n, nv))
-    return lv.Batch(jac, mass, free, target=target, compliance=compliance, mu=mu, cones=cones, friction=law)
+    return lv.Batch(
+        jac, mass, free, target=target, compliance=compliance, mu=mu, cones=cones, friction=law
+    )
 
 
 @pytest.fixture(params=[1, 2, 4, 8])
@@ -50,7 +63,11 @@ def width(request, monkeypatch):
 def test_lanes_have_the_bits_of_single_calls(width, rows, nv, n, law):
     batch = make_batch(rows // 3, nv, n, law)
     many = lv.solve_many(batch)
-    impulses = many.impulse, np.abs(many.impulse) * 1e8, np.random.default_rng(1).standard_normal((n, rows))
+    impulses = (
+        many.impulse,
+        np.abs(many.impulse) * 1e8,
+        np.random.default_rng(1).standard_normal((n, rows)),
+    )
     judged = [(x, lv.residual_many(batch, x)) for x in impulses]
     for i in range(n):
         one = lv.solve(batch[i])
@@ -95,9 +112,12 @@ def make_tree_batch(law, seed=1):
     parent = [-1, 0, 0, 2, 3, 4, 2, 6, 7, 0, 9, 10, -1, 12]
     below = [np.array(sorted(ancestors(parent, i))) for i in range(nv)]
     blocks = [
-        lv.Cones.contacts(0.7, count=2) + lv.Cones.bounded([0.0, -0.1, -np.inf], [np.inf, 0.1, np.inf]),
+        lv.Cones.contacts(0.7, count=2)
+        + lv.Cones.bounded([0.0, -0.1, -np.inf], [np.inf, 0.1, np.inf]),
         lv.Cones.bounded([0.0] * 8, [np.inf] * 8),
-        lv.Cones.bounded([0.0], [np.inf]) + lv.Cones.contacts([0.3, 1.0], count=2) + lv.Cones.bounded([-0.2], [0.2]),
+        lv.Cones.bounded([0.0], [np.inf])
+        + lv.Cones.contacts([0.3, 1.0], count=2)
+        + lv.Cones.bounded([-0.2], [0.2]),
     ]
     more = [lv.Cones.bounded([0.0] * k, [np.inf] * k) for k in range(4)]
     cones = [blocks[int(rng.integers(0, 3))] + more[int(rng.integers(0, 4))] for _ in range(n)]
@@ -137,10 +157,16 @@ def test_mixed_worlds_over_trees_have_the_bits_of_single_calls(width, law, tol):
         one = lv.solve(batch[i], tol=tol)
         assert many.impulse[rows].tobytes() == one.impulse.tobytes()
         assert (many.status[i], many.iterations[i]) == (one.status, one.iterations)
-        assert (many.relative[i], many.roundoff_floor[i]) == (one.residual.relative, one.residual.roundoff_floor)
+        assert (many.relative[i], many.roundoff_floor[i]) == (
+            one.residual.relative,
+            one.residual.roundoff_floor,
+        )
         single = lv.residual(batch[i], many.impulse[rows] + 1e-4)
         assert judged.relative[i] == single.relative
-        assert (judged.roundoff_floor[i], judged.worst_row[i]) == (single.roundoff_floor, single.worst_row)
+        assert (judged.roundoff_floor[i], judged.worst_row[i]) == (
+            single.roundoff_floor,
+            single.worst_row,
+        )
     assert many.success.all()
 
 

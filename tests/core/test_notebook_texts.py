@@ -20,7 +20,9 @@ def test_plot_of_a_solution_shows_worst_rows_and_history(solution):
     worst, history = solution.plot(rows=3).axes
     widths = [bar.get_width() for bar in worst.patches]
     assert widths == sorted(solution.residual.velocity_by_row)[-3:]
-    assert [text.get_text() for text in worst.get_yticklabels()][-1] == f"{solution.residual.worst_name} [m/s]"
+    assert [text.get_text() for text in worst.get_yticklabels()][
+        -1
+    ] == f"{solution.residual.worst_name} [m/s]"
     np.testing.assert_array_equal(history.lines[0].get_ydata(), solution.history.relative)
 
 

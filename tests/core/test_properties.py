@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import installed
-from random_problems import CONTACTS, add_compliance, random_bodies_and_contacts, random_contact_problem, spd
+from random_problems import (
+    CONTACTS,
+    add_compliance,
+    random_bodies_and_contacts,
+    random_contact_problem,
+    spd,
+)
 
 import lavender as lv
 from lavender.base import deadline
@@ -35,13 +41,19 @@ def draw_worlds(kind):
     rng = np.random.default_rng(0)
     jac = rng.normal(size=(6, 6, 9))
     mass = np.array([np.diag(rng.uniform(0.5, 2.0, 9)) for _ in range(6)])
-    free = -(jac[:, 0] + jac[:, 3] + 0.3 * jac[:, 1]) * np.array([1.0, 1e-6, 5e-7, 1e-7, 1.0, 1.0])[:, None]
+    free = (
+        -(jac[:, 0] + jac[:, 3] + 0.3 * jac[:, 1])
+        * np.array([1.0, 1e-6, 5e-7, 1e-7, 1.0, 1.0])[:, None]
+    )
     mass[2] *= 1e6
     cones = lv.Cones.contacts(0.5, count=2)
     if kind == "matrices":
         return [lv.Problem.contact(*spd(6, seed=i), mu=0.5) for i in range(3)]
     if kind == "bounded":
-        cones = [lv.Cones.bounded(np.full(6, 0.05 * i - 0.1), np.linspace(0.2, 0.2 * i + 0.2, 6)) for i in range(6)]
+        cones = [
+            lv.Cones.bounded(np.full(6, 0.05 * i - 0.1), np.linspace(0.2, 0.2 * i + 0.2, 6))
+            for i in range(6)
+        ]
     if kind == "zeros of M":
         for world, column in zip(mass, (0, 1, 2, 1, 0, 3), strict=True):
             world[4, column] = world[column, 4] = 0.3 * world[0, 0]
@@ -76,25 +88,33 @@ SINGLE = {
 def list_arrays(results):
     """Return the public attributes that are arrays with a number of each world."""
     names = [name for name in dir(results) if not name.startswith("_")]
-    found = {name for name in names if getattr(getattr(results, name), "shape", None) == (len(results),)}
+    found = {
+        name for name in names if getattr(getattr(results, name), "shape", None) == (len(results),)
+    }
     assert found <= SINGLE.keys() and {"relative", "energy", "worst_row", "roundoff_floor"} <= found
     return found
 
 
-@pytest.mark.parametrize("more", [{}, {"velocity_tol": 1e-3, "max_iter": 2}, {"max_iter": 1, "tol": 1e-12}])
+@pytest.mark.parametrize(
+    "more", [{}, {"velocity_tol": 1e-3, "max_iter": 2}, {"max_iter": 1, "tol": 1e-12}]
+)
 @pytest.mark.parametrize("solver", ["auto", "pgs"])
 @pytest.mark.parametrize("kind", WORLDS)
 def test_solve_many_arrays_equal_the_numbers_of_single_solutions(kind, solver, more):
     worlds = draw_worlds(kind)
     many = lv.solve_many(worlds, solver, **more)
-    judged = [lv.residual(p, s.impulse, precision="float64") for p, s in zip(worlds, many, strict=True)]
+    judged = [
+        lv.residual(p, s.impulse, precision="float64") for p, s in zip(worlds, many, strict=True)
+    ]
     for name in list_arrays(many):
         expected = [SINGLE[name](s, r) for s, r in zip(many, judged, strict=True)]
         assert getattr(many, name).tolist() == expected, name
     if more == {"velocity_tol": 1e-3, "max_iter": 2} and kind == "batch":
         assert (many.success & (many.relative > many.tol)).any()
     if kind != "matrices":
-        velocity = np.concatenate([p.velocity(s.impulse).ravel() for p, s in zip(worlds, many, strict=True)])
+        velocity = np.concatenate(
+            [p.velocity(s.impulse).ravel() for p, s in zip(worlds, many, strict=True)]
+        )
         np.testing.assert_allclose(many.velocity.ravel(), velocity, rtol=1e-12, atol=1e-15)
 
 
@@ -123,13 +143,18 @@ def test_velocity_tol_accepts_what_is_within_it_from_every_end_that_claims_nothi
 
 def test_verdict_changes_at_its_documented_factors():
     for floor in (1e-16, 1e-12, 1e-7):
-        assert is_residual_at_floor(1.99 * floor, floor) and not is_residual_at_floor(2.01 * floor, floor)
+        assert is_residual_at_floor(1.99 * floor, floor) and not is_residual_at_floor(
+            2.01 * floor, floor
+        )
     assert is_residual_at_floor(0.99e-5, 0.9e-5) and not is_residual_at_floor(1.01e-5, 0.9e-5)
     assert not is_residual_at_floor(0.0, 1e-3)
     problem = lv.Problem.lcp([[1.0]], [1.0])
     floor = lv.residual(problem, [1.0], "float32").roundoff_floor
     for factor, expected in ((3.9, "at its floor"), (4.2, "stopped before convergence")):
-        assert lv.residual(problem, [1.0 - factor * floor], "float32", threshold=0.0).verdict == expected
+        assert (
+            lv.residual(problem, [1.0 - factor * floor], "float32", threshold=0.0).verdict
+            == expected
+        )
     fast = lv.Problem.lcp([[1.0]], [10.0])
     for speed, expected in ((0.99, "close enough"), (1.01, "stopped before convergence")):
         assert lv.residual(fast, [10.0 - 1e-3 * speed], threshold=1e-3).verdict == expected
@@ -140,7 +165,10 @@ def test_verdict_of_the_zero_impulse_is_wrong_and_of_a_part_of_the_solution_unco
     problem = random_contact_problem(seed)
     solution = lv.solve(problem, tol=1e-12).impulse
     assert lv.residual(problem, problem.start(), threshold=0.0).verdict == "wrong"
-    assert lv.residual(problem, 0.999 * solution, threshold=0.0).verdict == "stopped before convergence"
+    assert (
+        lv.residual(problem, 0.999 * solution, threshold=0.0).verdict
+        == "stopped before convergence"
+    )
 
 
 def test_verdict_of_a_diverged_impulse_in_a_scene_at_rest_is_wrong():
@@ -155,7 +183,8 @@ def test_verdict_of_a_diverged_impulse_in_a_scene_at_rest_is_wrong():
 @pytest.mark.parametrize("islands", [1, 2])
 def test_relative_residual_of_an_impulse_that_hides_b_is_at_least_its_floor(islands):
     problem = lv.Problem.lcp(
-        sp.block_diag([[[1.0, -1.0], [-1.0, 1.0]]] + [np.eye(2)] * (islands - 1)), -np.ones(2 * islands)
+        sp.block_diag([[[1.0, -1.0], [-1.0, 1.0]]] + [np.eye(2)] * (islands - 1)),
+        -np.ones(2 * islands),
     )
     for power in range(10, 19):
         found = lv.residual(problem, np.r_[10.0**power, 10.0**power, np.zeros(2 * islands - 2)])
@@ -176,7 +205,9 @@ def test_row_that_no_impulse_moves_is_compared_with_its_target_and_the_velocity_
     )
     problem = lv.Problem.from_rows(rows, target=[target, 0.0])
     found = lv.residual(problem, problem.start())
-    assert problem.b[0] != 0.0 and found.relative == pytest.approx(abs(problem.b[0]) / (2.0 * target), rel=1e-12)
+    assert problem.b[0] != 0.0 and found.relative == pytest.approx(
+        abs(problem.b[0]) / (2.0 * target), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("form", ["bodies", "J and M", "matrix"])
@@ -190,13 +221,17 @@ def test_floor_energy_of_free_rows_is_that_of_numpy(form):
     b = problem.b
     d = problem.d
     mass = [np.diag(np.full(3, x)) for x in rows.inv_mass]
-    inverse = sp.block_diag([x for pair in zip(mass, np.abs(rows.inv_inertia), strict=True) for x in pair]).toarray()
+    inverse = sp.block_diag(
+        [x for pair in zip(mass, np.abs(rows.inv_inertia), strict=True) for x in pair]
+    ).toarray()
     jac = np.abs(problem.jacobian.toarray())
     terms = jac @ (inverse @ (jac.T @ np.abs(impulse))) + compliance * np.abs(impulse)
     if form == "J and M":  # with a diagonal M, which has a diagonal root
         jac = rng.normal(size=(problem.m, 12))
         mass = rng.uniform(0.5, 2.0, 12)
-        problem = lv.Problem.from_jacobian(jac, np.diag(mass), np.ones(12), cones=problem.cones, compliance=compliance)
+        problem = lv.Problem.from_jacobian(
+            jac, np.diag(mass), np.ones(12), cones=problem.cones, compliance=compliance
+        )
         b = problem.b
         d = problem.d
         jac = np.abs(jac)
@@ -237,11 +272,15 @@ def build_rows_of_every_kind(seed=2):
     low = np.array([0.3, 0.2, 0.0, -np.inf, -0.4, -0.5, -np.inf])
     high = np.array([0.3, 0.6, np.inf, np.inf, -0.4, 0.7, -0.1])
     target = np.r_[rng.normal(size=5), 0.2, rng.normal()]
-    return lv.Problem.from_jacobian(jac, spd(8)[0], np.ones(8), target=target, cones=lv.Cones.bounded(low, high))
+    return lv.Problem.from_jacobian(
+        jac, spd(8)[0], np.ones(8), target=target, cones=lv.Cones.bounded(low, high)
+    )
 
 
 @pytest.mark.parametrize("form", ["impulse", "velocity"])
-@pytest.mark.parametrize("name", installed("clarabel", "osqp", "daqp", "quadprog", "proxqp", "highs", "piqp", "scs"))
+@pytest.mark.parametrize(
+    "name", installed("clarabel", "osqp", "daqp", "quadprog", "proxqp", "highs", "piqp", "scs")
+)
 def test_backend_form_with_nonzero_limits_agrees_with_newton(name, form):
     used = set()
     for seed in (2, 4, 7):
@@ -258,7 +297,9 @@ def test_backend_form_with_nonzero_limits_agrees_with_newton(name, form):
 
 
 @pytest.mark.parametrize("form", ["impulse", "velocity"])
-@pytest.mark.parametrize("kind", ["one tangent", *(kind for kind in CONTACTS if kind != "ellipses")])
+@pytest.mark.parametrize(
+    "kind", ["one tangent", *(kind for kind in CONTACTS if kind != "ellipses")]
+)
 def test_backend_of_cones_with_every_kind_of_contact_agrees_with_newton(kind, form):
     pytest.importorskip("clarabel")
     draw = CONTACTS.get(kind) or partial(random_contact_problem, tangents=1, spin=False)
@@ -279,15 +320,24 @@ def test_every_solver_moves_a_row_that_no_velocity_feels_to_the_limit_that_b_req
         for ends, is_solved in ((limits, True), (sorted([-1.0 * sign, sign * np.inf]), False)):
             cones = lv.Cones.bounded([ends[0], 0.0], [ends[1], np.inf])
             whole = lv.Problem.from_jacobian(
-                [[0.0, 0.0], [1.0, 0.0]], np.eye(2), [0.0, 0.0], target=[0.5 * sign, 1.0], cones=cones
+                [[0.0, 0.0], [1.0, 0.0]],
+                np.eye(2),
+                [0.0, 0.0],
+                target=[0.5 * sign, 1.0],
+                cones=cones,
             )
             for problem in (whole, lv.Problem(whole.b, whole.cones, whole.csr)):
                 for name in lv.available(problem, external=False):
                     solution = lv.solve(problem, name)
                     if is_solved:
-                        np.testing.assert_allclose(solution.impulse, [2.0 * sign, 1.0], atol=1e-6, err_msg=name)
+                        np.testing.assert_allclose(
+                            solution.impulse, [2.0 * sign, 1.0], atol=1e-6, err_msg=name
+                        )
                     else:
-                        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", name
+                        assert (
+                            solution.status is lv.Status.INFEASIBLE
+                            and solution.claim_check == "confirmed"
+                        ), name
 
 
 @pytest.mark.parametrize("change", ["signs", "units", "origin"])
@@ -316,9 +366,13 @@ def test_equivalent_rows_take_the_same_work_and_have_equivalent_answers(name, ch
         ends = (low - shift) / factor, (high - shift) / factor
         more = {"tol": 1e-8, "max_iter": 2000}
         one = lv.solve(lv.Problem.lcp(a, b, low, high), name, **more)
-        changed = lv.Problem.lcp(a * np.outer(factor, factor), new_b, np.minimum(*ends), np.maximum(*ends))
+        changed = lv.Problem.lcp(
+            a * np.outer(factor, factor), new_b, np.minimum(*ends), np.maximum(*ends)
+        )
         other = lv.solve(changed, name, **more)
-        assert one.success == other.success and (one.success or name == "pgs"), f"{seed}: {one} {other}"
+        assert one.success == other.success and (one.success or name == "pgs"), (
+            f"{seed}: {one} {other}"
+        )
         if one.success:
             np.testing.assert_allclose(factor * other.impulse + shift, one.impulse, atol=1e-5)
         if name == "lemke":
@@ -341,10 +395,18 @@ class Steps:
 
     def __call__(self, scaled, start, limits, settings):
         self.calls += 1
-        self.received.append((int(np.sum(scaled.is_kept)) if scaled.is_kept is not None else "all", start, limits))
+        self.received.append(
+            (int(np.sum(scaled.is_kept)) if scaled.is_kept is not None else "all", start, limits)
+        )
         x = np.full(scaled.n, float(self.calls))
         work = {"iterations": 30}
-        return Answer(lv.Status[self.statuses[self.calls - 1]], f"call {self.calls}", x, np.zeros(len(scaled.t)), work)
+        return Answer(
+            lv.Status[self.statuses[self.calls - 1]],
+            f"call {self.calls}",
+            x,
+            np.zeros(len(scaled.t)),
+            work,
+        )
 
 
 @pytest.mark.parametrize(
@@ -362,13 +424,21 @@ def test_call_backend_until_accepted_returns_the_claim_of_the_best_call(statuses
     steps = Steps(statuses, accepted)
     more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
     found = call_backend_until_accepted(program, steps, steps, **more)
-    assert (steps.calls, found.message, found.status.name) == (len(accepted), f"call {best}", statuses[best - 1])
-    np.testing.assert_array_equal(found.point[0], program.restore_point(np.full(2, float(best)), np.zeros(1))[0])
+    assert (steps.calls, found.message, found.status.name) == (
+        len(accepted),
+        f"call {best}",
+        statuses[best - 1],
+    )
+    np.testing.assert_array_equal(
+        found.point[0], program.restore_point(np.full(2, float(best)), np.zeros(1))[0]
+    )
     assert found.work["backend_calls"] == steps.calls
 
 
 def test_second_call_of_a_backend_has_all_rows_a_smaller_tolerance_and_the_rest_of_the_budget():
-    program = get_program(lv.Problem.from_qp(np.diag([4.0, 1e4]), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp)
+    program = get_program(
+        lv.Problem.from_qp(np.diag([4.0, 1e4]), [4.0, 1e-3], G=np.eye(2), h=[1.0, 1e9]).qp
+    )
     steps = Steps(["STALLED", "CONVERGED"], [False, True])
     start = (np.array([3.0, 5.0]), np.array([7.0, 11.0]))
     more = {"max_iter": 100, "tol": 1e-6, "deadline": deadline.NEVER, "settings": {}}
@@ -424,17 +494,28 @@ def test_classify_status_of_a_backend_wording_is_never_more_certain(text, status
 
 
 def test_program_rows_below_the_infinite_size_are_kept_and_their_multipliers_return():
-    program = {"A": [[1.0, 1.0, 0.0]], "b": [1.0], "G": np.ones((4, 3)), "h": [1.0, 5e19, 1e20, np.inf]}
-    problem = lv.Problem.from_qp(np.eye(3), np.ones(3), **program, lb=[-1.0, 0.5, -np.inf], ub=[np.inf, 0.5, 2.0])
+    program = {
+        "A": [[1.0, 1.0, 0.0]],
+        "b": [1.0],
+        "G": np.ones((4, 3)),
+        "h": [1.0, 5e19, 1e20, np.inf],
+    }
+    problem = lv.Problem.from_qp(
+        np.eye(3), np.ones(3), **program, lb=[-1.0, 0.5, -np.inf], ub=[np.inf, 0.5, 2.0]
+    )
     qp = problem.qp
-    assert len(qp.target) == 2 + 2 + 2  # two equations, of which one has equal bounds, two rows of G, two bounds
+    assert (
+        len(qp.target) == 2 + 2 + 2
+    )  # two equations, of which one has equal bounds, two rows of G, two bounds
     scaled = get_program(qp).scaled
     lam = np.arange(1.0, len(qp.target) + 1.0)
     np.testing.assert_array_equal(scaled.join_multipliers(*scaled.split_multipliers(lam)), lam)
     x = np.array([0.3, 0.5, -0.2])
     y = lam
     convex = get_program(qp)
-    for found, expected in zip(convex.restore_point(*convex.scale_point(x, y)), (x, y), strict=True):
+    for found, expected in zip(
+        convex.restore_point(*convex.scale_point(x, y)), (x, y), strict=True
+    ):
         np.testing.assert_array_equal(found, expected)
 
 
@@ -454,7 +535,9 @@ def test_solve_qp_of_unequally_scaled_variables_meets_tol_in_its_own_terms(name)
         for tol in (1e-4, 1e-7):
             answer = lv.solve_qp(P, q, G, h, solver=name, tol=tol)
             assert answer.found and answer.error <= tol, f"{name}, {seed}, {tol}: {answer}"
-            assert (G @ answer.x - h <= 10.0 * tol * (np.abs(G) @ np.abs(answer.x) + np.abs(h))).all()
+            assert (
+                G @ answer.x - h <= 10.0 * tol * (np.abs(G) @ np.abs(answer.x) + np.abs(h))
+            ).all()
             assert (answer.z >= -10.0 * tol * np.abs(answer.z).max(initial=0.0)).all()
 
 
@@ -468,7 +551,9 @@ def test_converted_rows_keep_their_start_and_are_never_worse(name, friction):
     for seed in range(6):
         a, b = spd(9, seed=seed)
         problem = lv.Problem(b, cones, a, friction=friction)
-        inside = project_impulse(cones, np.random.default_rng(seed).normal(size=9) * np.array([9.0, 1.0, 1.0] * 3))
+        inside = project_impulse(
+            cones, np.random.default_rng(seed).normal(size=9) * np.array([9.0, 1.0, 1.0] * 3)
+        )
         form = convert_to_bounded_rows(problem)
         np.testing.assert_allclose(form.to_impulse @ form.convert_start(inside), inside, atol=1e-14)
         good = lv.solve(problem, "newton", tol=1e-13)
@@ -476,7 +561,9 @@ def test_converted_rows_keep_their_start_and_are_never_worse(name, friction):
         for given in (good.impulse, start):
             found = lv.solve(problem, name, impulse=given, max_iter=1, tol=1e-15)
             before = lv.residual(problem, project_impulse(cones, given)).relative
-            assert found.residual.relative <= max(before, 2.0 * found.residual.roundoff_floor) * (1 + 1e-9), seed
+            assert found.residual.relative <= max(before, 2.0 * found.residual.roundoff_floor) * (
+                1 + 1e-9
+            ), seed
 
 
 def test_converted_rows_add_the_work_of_the_solver_that_continues():
@@ -536,7 +623,9 @@ def test_direct_with_a_factor_that_fails_at_last_returns_its_best_iterate(monkey
     """The steps of the first solves are a little too short and are refined, the third is wrong by far."""
     a = np.diag([1.0, -2.0, 3.0]) + 0.1
     steps = iter([0.99, 0.99, -1e3, 1.0])
-    monkeypatch.setattr(direct.RankRevealingFactor, "solve", lambda self, w: next(steps) * np.linalg.solve(a, w))
+    monkeypatch.setattr(
+        direct.RankRevealingFactor, "solve", lambda self, w: next(steps) * np.linalg.solve(a, w)
+    )
     solution = lv.solve(lv.Problem.linear(a, np.ones(3)), "direct", tol=1e-9)
     assert solution.residual.relative == pytest.approx(1e-4, rel=1e-3) and next(steps) == 1.0
     assert not solution.success and solution.status is lv.Status.STALLED
@@ -558,7 +647,9 @@ def test_cross_check_objective_is_that_of_numpy():
 
 def test_cross_check_reference_with_a_large_floor_is_not_an_optimum():
     near = 1.0 - 2.0**-40
-    problem = lv.Problem.linear([[1.0, near, 0.3], [near, 1.0, 0.3], [0.3, 0.3, 1.0]], [0.3, -0.7, 0.1])
+    problem = lv.Problem.linear(
+        [[1.0, near, 0.3], [near, 1.0, 0.3], [0.3, 0.3, 1.0]], [0.3, -0.7, 0.1]
+    )
     check = lv.cross_check(problem, ["direct"], reference="direct")
     assert 10.0 * check.rows[0].roundoff_floor > check.rows[0].relative > 1e-5
     assert check.reference != "direct" and "direct: relative" in check.reference_note
@@ -570,7 +661,8 @@ def test_residual_of_ellipses_has_row_errors_in_the_metric_of_the_disk():
     found = lv.residual(problem, 0.1 * np.abs(b))
     assert found.velocity_by_row.max() <= found.velocity * (1.0 + 1e-12)
     np.testing.assert_allclose(
-        found.velocity_by_row, lv.residual(problem.disk, problem.on_disk(0.1 * np.abs(b))).velocity_by_row
+        found.velocity_by_row,
+        lv.residual(problem.disk, problem.on_disk(0.1 * np.abs(b))).velocity_by_row,
     )
 
 
@@ -592,7 +684,10 @@ def test_solution_history_and_time_exclude_the_judge(monkeypatch):
     assert now[0] > 0.0 and solution.history.time.max() == solution.solve_time == 0.0
     for name in lv.available(problem, history=True, callback=True):
         seen = []
-        more = {"history": True, "callback": lambda k, x, r: seen.append((k, r.relative, r.energy, r.velocity))}  # noqa: B023
+        more = {
+            "history": True,
+            "callback": lambda k, x, r: seen.append((k, r.relative, r.energy, r.velocity)),
+        }  # noqa: B023
         solution = lv.solve(problem, name, tol=1e-9, max_iter=40, **more)
         history = solution.history
         assert history.time.max() == solution.solve_time == 0.0, name
@@ -615,10 +710,15 @@ def test_gradient_by_mass_is_symmetric_and_of_a_doubled_contact_that_of_the_sing
     np.testing.assert_allclose(by_mass, by_mass.T, rtol=1e-12, atol=1e-15)
     general = problem.generalized
     twice = lv.Problem.from_jacobian(
-        sp.vstack([general.jac, general.jac]), general.mass, general.v_free, cones=lv.Cones.contacts(0.5, count=4)
+        sp.vstack([general.jac, general.jac]),
+        general.mass,
+        general.v_free,
+        cones=lv.Cones.contacts(0.5, count=4),
     )
     both = lv.solve(twice, tol=1e-13)
-    np.testing.assert_allclose(twice.velocity(both.impulse), problem.velocity(solution.impulse), atol=1e-9)
+    np.testing.assert_allclose(
+        twice.velocity(both.impulse), problem.velocity(solution.impulse), atol=1e-9
+    )
     found = lv.derivative(twice, both).vjp(velocity=np.arange(1.0, 10.0))
     np.testing.assert_allclose(found.v_free, gradient.v_free, atol=1e-6)
 
@@ -630,20 +730,28 @@ def build_chain(order):
     """Build a branched chain of 40 velocities, numbered by `order`, of which only some have rows of J."""
     rng = np.random.default_rng(5)
     parent = [-1, *((i - 1) // 2 for i in range(1, 40))]
-    root = np.eye(40) + sum(0.3 * np.outer(np.eye(40)[i], np.eye(40)[p]) for i, p in enumerate(parent) if p >= 0)
+    root = np.eye(40) + sum(
+        0.3 * np.outer(np.eye(40)[i], np.eye(40)[p]) for i, p in enumerate(parent) if p >= 0
+    )
     jac = np.zeros((9, 40))
     for row, leaf in enumerate((39, 38, 30, 21, 20, 12, 7, 3, 0)):
         jac[row, leaf] = 1.0
         jac[row, parent[leaf]] += 0.5
     mass = (root.T @ root)[np.ix_(order, order)]
     return lv.Problem.from_jacobian(
-        jac[:, order], mass, rng.normal(size=40)[order], cones=lv.Cones.contacts([0.5] * 3, 2), compliance=1e-3
+        jac[:, order],
+        mass,
+        rng.normal(size=40)[order],
+        cones=lv.Cones.contacts([0.5] * 3, 2),
+        compliance=1e-3,
     )
 
 
 def test_generalized_reordered_mass_is_shifted_in_the_given_order():
     n = 400
-    line = sp.diags_array([np.full(19, -1.0), np.full(20, 4.5), np.full(19, -1.0)], offsets=[-1, 0, 1])
+    line = sp.diags_array(
+        [np.full(19, -1.0), np.full(20, 4.5), np.full(19, -1.0)], offsets=[-1, 0, 1]
+    )
     order = np.random.default_rng(1).permutation(n)
     eye = sp.eye_array(20)
     mass = sp.csr_array(sp.kron(line, eye) + sp.kron(eye, line))[order][:, order]
@@ -677,7 +785,9 @@ def list_problems_with_islands():
     )
     rng = np.random.default_rng(8)
     rows = random_bodies_and_contacts(rng, bodies=12, joints=2, contacts=5)
-    bodies = lv.Problem.from_rows(rows, mu=0.5, compliance=rng.uniform(0.0, 0.1, rows.joint_ptr[-1] + 15))
+    bodies = lv.Problem.from_rows(
+        rows, mu=0.5, compliance=rng.uniform(0.0, 0.1, rows.joint_ptr[-1] + 15)
+    )
     return [general, bodies, lv.Problem(bodies.b, bodies.cones, bodies.csr)]
 
 
@@ -693,10 +803,14 @@ def test_islands_of_a_matrix_are_connected_by_any_of_their_rows(row, column):
 def test_references_of_a_problem_are_those_of_its_islands_together(kind):
     problem = list_problems_with_islands()[kind]
     found = lv.residual(problem, problem.start())
-    energy, velocity = (np.maximum(x, 0.0) for x in (found.islands.energy_at_zero, found.islands.velocity_at_zero))
+    energy, velocity = (
+        np.maximum(x, 0.0) for x in (found.islands.energy_at_zero, found.islands.velocity_at_zero)
+    )
     assert len(energy) > 1 and velocity.argmax() < len(velocity) - 1
     assert found.energy_at_zero == pytest.approx(np.linalg.norm(energy))
-    assert found.velocity_at_zero == velocity.max() and found.relative == found.islands.relative.max()
+    assert (
+        found.velocity_at_zero == velocity.max() and found.relative == found.islands.relative.max()
+    )
     solution = lv.solve(problem, "newton", velocity_tol=1e-4)
     assert solution.success and solution.residual.velocity <= 1e-4
 
@@ -732,14 +846,20 @@ def test_sweeps_solve_a_slow_island_although_another_has_no_solution(name):
 @pytest.mark.parametrize("name", ["auto", "direct", "newton"])
 def test_stages_begin_at_the_start_and_end_at_the_result(name):
     for seed in range(3):
-        problem = random_contact_problem(seed) if name != "direct" else lv.Problem.lcp(*spd(6, seed=seed))
+        problem = (
+            random_contact_problem(seed) if name != "direct" else lv.Problem.lcp(*spd(6, seed=seed))
+        )
         start = 0.5 * lv.solve(problem, tol=1e-9).impulse
         for given in (None, start):
             solution = lv.solve(problem, name, impulse=given, tol=1e-7)
-            before = lv.residual(problem, problem.start() if given is None else project_impulse(problem.cones, given))
+            before = lv.residual(
+                problem, problem.start() if given is None else project_impulse(problem.cones, given)
+            )
             if solution.stages:
                 assert solution.stages[0].before == pytest.approx(before.relative, rel=1e-9)
-                assert solution.stages[-1].after == pytest.approx(solution.residual.relative, rel=1e-9)
+                assert solution.stages[-1].after == pytest.approx(
+                    solution.residual.relative, rel=1e-9
+                )
             assert solution.stages or name != "auto"
 
 
@@ -750,17 +870,26 @@ def test_auto_proves_an_infeasible_island_of_any_signs_at_any_place(place, signs
     rows, one, other = [], *signs
     for island in range(3):
         target = [one, 0.0] if island == place else [-one, -0.5 * other]
-        low, high = (np.where(np.array([one, -other]) > 0.0, x, -y) for x, y in ((0.0, np.inf), (np.inf, 0.0)))
+        low, high = (
+            np.where(np.array([one, -other]) > 0.0, x, -y)
+            for x, y in ((0.0, np.inf), (np.inf, 0.0))
+        )
         jac = [[one, 0.2 * one], [other, 0.2 * other]]
         cones = lv.Cones.bounded(low, high)
-        rows.append(lv.Problem.from_jacobian(jac, np.eye(2), [0.0, 0.0], target=target, cones=cones))
+        rows.append(
+            lv.Problem.from_jacobian(jac, np.eye(2), [0.0, 0.0], target=target, cones=cones)
+        )
     jac = sp.block_diag([p.generalized.jac for p in rows])
     b = np.concatenate([p.b for p in rows])
-    cones = lv.Cones.bounded(*(np.concatenate([getattr(p.cones, n) for p in rows]) for n in ("lower", "upper")))
+    cones = lv.Cones.bounded(
+        *(np.concatenate([getattr(p.cones, n) for p in rows]) for n in ("lower", "upper"))
+    )
     whole = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), target=b, cones=cones)
     for problem in (whole, lv.Problem(whole.b, whole.cones, whole.csr)):
         solution = lv.solve(problem)
-        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(solution)
+        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(
+            solution
+        )
         assert np.flatnonzero(solution.certificate).tolist() == [2 * place, 2 * place + 1]
         np.testing.assert_array_equal(solution.impulse, project_impulse(cones, solution.impulse))
 
@@ -791,12 +920,23 @@ def test_sweeps_move_a_pinned_body_that_turns_in_every_order(order):
 
 
 def test_recorder_with_every_and_keep_worst_keeps_selected_steps(tmp_path):
-    batch = lv.Batch(np.ones((1, 1, 1)), np.ones((1, 1, 1)), -np.ones((1, 1)), cones=lv.Cones.contacts(0.0, tangents=0))
+    batch = lv.Batch(
+        np.ones((1, 1, 1)),
+        np.ones((1, 1, 1)),
+        -np.ones((1, 1)),
+        cones=lv.Cones.contacts(0.0, tangents=0),
+    )
     with lv.io.Recorder(tmp_path / "a", every=2, keep_worst=1) as recorder:
         for error in (0.1, 0.2, 0.3, 0.05, 0.4, 0.25):
             recorder.add(lv.io.EngineStep(batch, np.array([[1.0 - error]]), None))
-    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
-    assert sorted(line["step"] for line in lines) == [0, 2, 4] == sorted(int(name[5:11]) for name in recorder.files)
+    lines = [
+        json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()
+    ]
+    assert (
+        sorted(line["step"] for line in lines)
+        == [0, 2, 4]
+        == sorted(int(name[5:11]) for name in recorder.files)
+    )
 
 
 @pytest.mark.parametrize("speed", [1e4, 1.0, 1e-3])
@@ -808,7 +948,9 @@ def test_solution_to_a_velocity_error_is_converged_exactly_if_it_meets_it(speed)
         solution = lv.solve(problem, "pgs", velocity_tol=1e-3, max_iter=n)
         statuses.add(solution.status.name)
         is_met = solution.residual.velocity <= 1e-3
-        assert solution.success == is_met == (solution.status is lv.Status.CONVERGED), f"{n}: {solution}"
+        assert solution.success == is_met == (solution.status is lv.Status.CONVERGED), (
+            f"{n}: {solution}"
+        )
     assert statuses >= ({"CONVERGED"} if speed < 1.0 else {"MAX_ITERATIONS"})
 
 
@@ -818,4 +960,6 @@ def test_solution_that_meets_tol_at_its_iteration_limit_is_converged(seed):
     for name in lv.available(problem, history=True):
         for n in (*range(1, 30), 45, 77, 130):
             solution = lv.solve(problem, name, tol=1e-2, max_iter=n)
-            assert solution.success == (solution.status is lv.Status.CONVERGED), f"{name}, {n}: {solution}"
+            assert solution.success == (solution.status is lv.Status.CONVERGED), (
+                f"{name}, {n}: {solution}"
+            )

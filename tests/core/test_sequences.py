@@ -15,8 +15,20 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from calls import facts
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, precondition, rule, run_state_machine_as_test
-from random_problems import CONTACTS, add_compliance, as_matrix, make_problem_with_other_numbers, random_contact_problem
+from hypothesis.stateful import (
+    Bundle,
+    RuleBasedStateMachine,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from random_problems import (
+    CONTACTS,
+    add_compliance,
+    as_matrix,
+    make_problem_with_other_numbers,
+    random_contact_problem,
+)
 
 import lavender as lv
 from lavender import registry
@@ -53,7 +65,10 @@ def on_exact_velocities(problem):
 @functools.cache
 def problems_of(solver):
     """Return keyed problems of every kind, form and a few sizes that a solver accepts; their keys overlap."""
-    drawn = [random_contact_problem(31, contacts=0, joints=4), random_contact_problem(32, tangents=0, spin=False)]
+    drawn = [
+        random_contact_problem(31, contacts=0, joints=4),
+        random_contact_problem(32, tangents=0, spin=False),
+    ]
     for law in ("coulomb", "cone"):
         for i, draw in enumerate(CONTACTS.values()):
             drawn.append(draw(40 + i, law, bodies=3, joints=i % 3, contacts=1 + i))
@@ -78,7 +93,10 @@ def carry_by_keys(before, impulse, problem):
     for i, key in enumerate(problem.key):
         for j in np.flatnonzero(before.key == key):
             to, of = (slice(*c.ptr[k : k + 2]) for c, k in ((problem.cones, i), (before.cones, j)))
-            if problem.cones.kind[i] == before.cones.kind[j] and to.stop - to.start == of.stop - of.start:
+            if (
+                problem.cones.kind[i] == before.cones.kind[j]
+                and to.stop - to.start == of.stop - of.start
+            ):
                 start[to] = impulse[of]
     return start
 
@@ -150,7 +168,9 @@ class Calls(RuleBasedStateMachine):
         target = self.problem.b + jac @ free  # It stays where b is not given.
         free[entry % len(free)] = value
         b = b if with_b else target - jac @ free
-        self.problem = replace(self.problem, b=b, generalized=type(general)(jac, general.mass, free), guess=None)
+        self.problem = replace(
+            self.problem, b=b, generalized=type(general)(jac, general.mass, free), guess=None
+        )
         return self.compare({"v_free": free} | ({"b": b} if with_b else {}))
 
     @rule(target=solutions, before=solutions, i=st.integers(0, 99), pair=st.booleans())
@@ -160,9 +180,14 @@ class Calls(RuleBasedStateMachine):
         if not registry.get(self.solver).impulse:
             return self.compare({"problem": self.problem})
         start = carry_by_keys(old, solution.impulse, self.problem)
-        return self.compare({"problem": self.problem}, start, (old, solution.impulse) if pair else solution)
+        return self.compare(
+            {"problem": self.problem}, start, (old, solution.impulse) if pair else solution
+        )
 
-    @rule(bad=st.sampled_from([{"b": [np.nan]}, {"tol": -1.0}, {"no_such": 1}, {"problem": 1}]), i=st.integers(0, 99))
+    @rule(
+        bad=st.sampled_from([{"b": [np.nan]}, {"tol": -1.0}, {"no_such": 1}, {"problem": 1}]),
+        i=st.integers(0, 99),
+    )
     def call_with_a_mistake(self, bad, i):
         with pytest.raises(lv.LavenderError):
             self.prepared.solve(**{"problem": self.pool[i % len(self.pool)]} | bad)
@@ -188,7 +213,9 @@ class Calls(RuleBasedStateMachine):
     def solve_in_threads(self):
         calls = [self.prepared.solve, *[functools.partial(lv.solve, self.problem, self.solver)] * 2]
         with ThreadPoolExecutor(3) as pool:
-            found = [facts(future.result()) for future in [pool.submit(call, tol=1e-6) for call in calls]]
+            found = [
+                facts(future.result()) for future in [pool.submit(call, tol=1e-6) for call in calls]
+            ]
         assert found == [facts(lv.solve(fresh(self.problem), self.solver, tol=1e-6))] * 3
 
     @rule(seed=seeds, tol=st.sampled_from([0.0, 1e-9, 0.3]))

@@ -68,9 +68,13 @@ def test_cones_and_problems_from_lists_equal_those_from_arrays() -> None:
     problem = lv.Problem([1], cones, [[2.0]], guess=[0.5], key=[3], names=["a"])
     guess = np.full(1, 0.5)
     key = np.array([3])
-    assert problem == lv.Problem(np.ones(1), cones, np.full((1, 1), 2.0), guess=guess, key=key, names=("a",))
+    assert problem == lv.Problem(
+        np.ones(1), cones, np.full((1, 1), 2.0), guess=guess, key=key, names=("a",)
+    )
     assert lv.Problem.lcp([[2.0]], [1], [0], [1]).cones == cones
-    general = lv.Problem.from_jacobian([[1.0]], [[0.5]], [-1], cones=cones, target=[0], compliance=[0.1])
+    general = lv.Problem.from_jacobian(
+        [[1.0]], [[0.5]], [-1], cones=cones, target=[0], compliance=[0.1]
+    )
     assert general.b.tolist() == [1.0]
 
 
@@ -81,7 +85,12 @@ class Halves:
         return problem
 
     def run(
-        self, state: lv.Problem, impulse: npt.NDArray[np.float64], n: int, tol: float, time_limit: float | None
+        self,
+        state: lv.Problem,
+        impulse: npt.NDArray[np.float64],
+        n: int,
+        tol: float,
+        time_limit: float | None,
     ) -> lv.Claim:
         impulse *= 0.5**n
         return lv.Claim(lv.Status.MAX_ITERATIONS, n)
@@ -89,7 +98,9 @@ class Halves:
 
 def test_register_of_a_class_without_base_is_accepted(register: Any) -> None:
     register(lv.SolverSpec(name="halves", factory=Halves, laws=frozenset({"lcp"}), summary=""))
-    solution = lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "halves", impulse=[8.0], tol=0.0, max_iter=3)
+    solution = lv.solve(
+        lv.Problem.lcp([[1.0]], [1.0]), "halves", impulse=[8.0], tol=0.0, max_iter=3
+    )
     assert solution.impulse.tolist() == [1.0]
 
 
@@ -111,8 +122,19 @@ def test_rows_of_empty_lists_have_no_contacts_joints_or_bodies(bodies: int) -> N
         arm_a=EMPTY,
         arm_b=EMPTY,
     )
-    assert rows == lv.Rows(np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6)))
+    assert rows == lv.Rows(
+        np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6))
+    )
     problem = lv.Problem.from_rows(rows, target=EMPTY, mu=EMPTY)
     assert problem.m == 0 and lv.solve(problem).success
     with pytest.raises(lv.InputError, match=r"contact_body has shape \(1, 2\); \(0, 2\) is needed"):
-        lv.Rows(mass, inertia, free, contact_body=[(-1, 0)], normal=EMPTY, tangent=EMPTY, arm_a=EMPTY, arm_b=EMPTY)
+        lv.Rows(
+            mass,
+            inertia,
+            free,
+            contact_body=[(-1, 0)],
+            normal=EMPTY,
+            tangent=EMPTY,
+            arm_a=EMPTY,
+            arm_b=EMPTY,
+        )

@@ -15,7 +15,11 @@ def cone_problem(seed):
 @pytest.mark.parametrize("form", ["rows", "J and M"])
 @given(seed=seeds)
 def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_difference(form, seed):
-    p = random_contact_problem(seed, friction="cone") if form == "rows" else random_generalized_problem(seed)
+    p = (
+        random_contact_problem(seed, friction="cone")
+        if form == "rows"
+        else random_generalized_problem(seed)
+    )
     x = np.random.default_rng(seed).normal(size=p.m)
     e = lv.motion_error(p, x)
     if e.rows is None:
@@ -43,9 +47,24 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     ("problem", "none", "some", "word"),
     [
         (random_lcp(4), ("kinetic", "speed"), ("energy", "rows", "relative"), ""),
-        (lv.Problem.lcp([[2.0, 0.5], [0.0, 2.0]], [1.0, -1.0]), ("energy", "relative"), ("rows",), "symmetric"),
-        (lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, -1.0], 0.0, 1.0), ("energy",), ("rows",), "semidefinite"),
-        (lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ("energy", "rows"), (), "no estimate"),
+        (
+            lv.Problem.lcp([[2.0, 0.5], [0.0, 2.0]], [1.0, -1.0]),
+            ("energy", "relative"),
+            ("rows",),
+            "symmetric",
+        ),
+        (
+            lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, -1.0], 0.0, 1.0),
+            ("energy",),
+            ("rows",),
+            "semidefinite",
+        ),
+        (
+            lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]),
+            ("energy", "rows"),
+            (),
+            "no estimate",
+        ),
     ],
     ids=["matrix", "asymmetric", "indefinite", "infeasible"],
 )
@@ -77,7 +96,9 @@ def test_motion_error_judges_a_given_reference_impulse_or_solution():
 def test_motion_error_of_ellipses_is_in_the_given_rows(form):
     p = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.005)], friction="cone")
     if form == "bodies":
-        p = lv.Problem.from_jacobian(np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone")
+        p = lv.Problem.from_jacobian(
+            np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone"
+        )
     x = lv.solve(p, tol=1e-13).impulse
     y = x.copy()
     y[2] *= 0.5

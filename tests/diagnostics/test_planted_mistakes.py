@@ -51,19 +51,25 @@ class Step:
     v_free: Any = None  # v + dt a
 
     def __post_init__(self):
-        self.v_free = self.before + self.dt * self.acceleration if self.v_free is None else self.v_free
+        self.v_free = (
+            self.before + self.dt * self.acceleration if self.v_free is None else self.v_free
+        )
 
     @property
     def problem(self):
         """The problem, by rows if there are rows."""
         c = self.cones
         if self.rows is None:
-            return lv.Problem.from_jacobian(self.jac, self.mass, self.v_free, target=self.target, cones=c)
+            return lv.Problem.from_jacobian(
+                self.jac, self.mass, self.v_free, target=self.target, cones=c
+            )
         rows = replace(self.rows, v_free=self.v_free.reshape(-1, 6))
         kj = self.rows.n_joints
         mj = len(rows.jac)
         bounds = {"lower": c.lower[:mj], "upper": c.upper[:mj]}
-        return lv.Problem.from_rows(rows, self.target, mu=c.mu[kj:], tangents=c.n_tangents[kj:], **bounds)
+        return lv.Problem.from_rows(
+            rows, self.target, mu=c.mu[kj:], tangents=c.n_tangents[kj:], **bounds
+        )
 
     @property
     def state(self):
@@ -98,7 +104,9 @@ class Step:
     def with_angles_of_friction(self):
         """Return the step with coefficients of friction as angles in degrees."""
         c = self.cones
-        return replace(self, cones=replace(c, mu=np.where(c.kind == lv.ROW, c.mu, np.degrees(np.arctan(c.mu)))))
+        return replace(
+            self, cones=replace(c, mu=np.where(c.kind == lv.ROW, c.mu, np.degrees(np.arctan(c.mu))))
+        )
 
 
 NONE = "none"
@@ -114,13 +122,17 @@ MISTAKES = {
     "mu in degrees": lambda s: s.with_angles_of_friction(),
 }
 #: Kinds of the mistakes that only the state before the step shows.
-SHOWN_BY_STATE = dict.fromkeys(list(MISTAKES)[3:6], "targets") | dict.fromkeys(list(MISTAKES)[6:8], "v_free")
+SHOWN_BY_STATE = dict.fromkeys(list(MISTAKES)[3:6], "targets") | dict.fromkeys(
+    list(MISTAKES)[6:8], "v_free"
+)
 
 
 def plant(step):
     """Yield each mistake that changes something, first none, and the step with it."""
     for name, change in MISTAKES.items():
-        has_no_targets = SHOWN_BY_STATE.get(name) == "targets" and not step.target[step.contacts[:, 0]].any()
+        has_no_targets = (
+            SHOWN_BY_STATE.get(name) == "targets" and not step.target[step.contacts[:, 0]].any()
+        )
         if not (has_no_targets or (name == "mu in degrees" and not np.any(step.cones.mu > 0.0))):
             yield name, change(step)
 
@@ -142,7 +154,9 @@ def scene_step(name, parameters, steps):
     target[touching] = OVERLAP_FRACTION_PER_STEP * overlap / dt
     gap = -dt * np.where(target > 0.0, target / OVERLAP_FRACTION_PER_STEP, target)[contact]
     fall = np.where(rows.inv_mass[:, None] > 0.0, [0.0, 0.0, -9.81, 0.0, 0.0, 0.0], 0.0).ravel()
-    mass = np.linalg.inv(rows.inverse_mass_matrix().toarray()) if np.all(rows.inv_mass > 0.0) else None
+    mass = (
+        np.linalg.inv(rows.inverse_mass_matrix().toarray()) if np.all(rows.inv_mass > 0.0) else None
+    )
     v = rows.v_free.ravel() - dt * fall
     return Step(p.jacobian.toarray(), mass, v, fall, dt, target, p.cones, gap, rows)
 
@@ -180,7 +194,10 @@ def test_diagnose_with_state_finds_every_planted_mistake(scenes):
             if mistake == NONE:
                 assert count == 0, (form, has_state)
             elif has_state:
-                assert count == total, (mistake, form)  # the state of the engine reveals every planted mistake
+                assert count == total, (
+                    mistake,
+                    form,
+                )  # the state of the engine reveals every planted mistake
 
 
 @pytest.mark.parametrize("mistake", [mistake for mistake in MISTAKES if mistake != NONE])
@@ -206,7 +223,10 @@ def test_diagnose_of_a_kinematic_tree_does_not_assume_rigid_bodies(scenes, has_r
     with_joint[n, n], with_joint[n, 3], with_joint[3, n] = 0.1, 0.01, 0.01
     jac = np.pad(flipped.jac, ((0, 0), (0, 1)))
     jac[:3, n] = 0.3
-    more = {"before": np.append(flipped.before, 0.0), "acceleration": np.append(flipped.acceleration, 0.0)}
+    more = {
+        "before": np.append(flipped.before, 0.0),
+        "acceleration": np.append(flipped.acceleration, 0.0),
+    }
     assert kinds(replace(flipped, jac=jac, mass=with_joint, v_free=None, **more).problem) == set()
 
 
@@ -217,7 +237,9 @@ def test_diagnose_of_a_conveyor_reports_nothing(scenes):
     assert kinds(replace(step, target=target).problem) == set()
 
 
-@pytest.mark.parametrize(("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])])  # m, at 60 steps per second
+@pytest.mark.parametrize(
+    ("offset", "kinds"), [(0.5, []), (5.0, ["joint targets"])]
+)  # m, at 60 steps per second
 def test_diagnose_of_anchors_in_a_wrong_frame_reports_them(offset, kinds):
     builder = lv.RowBuilder([1.0], np.eye(3)[None], np.zeros((1, 6)), 1 / 60, [(1.0, 0.0, 0.0)])
     builder.hinge(-1, 0, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), anchor_b=(0.0, 0.0, offset))

@@ -41,7 +41,12 @@ def test_redundancy_of_an_indefinite_matrix_has_its_rank(seed):
     g = rng.normal(size=(m, r))
     signs = rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
     a = g * signs @ g.T
-    a = np.block([[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]])
+    a = np.block(
+        [
+            [0.5 * (a + a.T), np.zeros((m, 2))],
+            [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])],
+        ]
+    )
     problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
     found = redundancy(problem)
     assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))
@@ -78,14 +83,18 @@ def test_redundancy_rank_of_a_sparse_island_is_that_of_its_eigenvalues():
     unit = sp.diags_array(1.0 / np.sqrt(a.diagonal()))
     values = np.linalg.eigvalsh((unit @ a @ unit).toarray())
     found = redundancy(lv.Problem.linear(a, np.zeros(a.shape[0])))
-    assert not ((values > 1e-13) & (values < 1e-7)).any()  # zeros are roundings, all others far above
+    assert not (
+        (values > 1e-13) & (values < 1e-7)
+    ).any()  # zeros are roundings, all others far above
     assert found.rank == np.count_nonzero(values > 1e-7)
     kept = np.delete(np.arange(a.shape[0]), found.rows)
     np.linalg.cholesky((unit @ a @ unit).toarray()[np.ix_(kept, kept)])  # and they are independent
 
 
 @pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
-@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 96])  # A_ii up to 1e59, the door is at 1e60
+@pytest.mark.parametrize(
+    "spread", [0, 30, 44, 50, 66, 88, 96]
+)  # A_ii up to 1e59, the door is at 1e60
 def test_redundancy_rank_at_any_scale_is_that_of_exact_numbers(form, spread):
     """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
     rng = np.random.default_rng(spread)

@@ -22,7 +22,11 @@ SCENES = {
 
 def given(problem):
     """Rows as somebody would give them, and b's target."""
-    rows = {f.name: np.array(getattr(problem.rows, f.name)) for f in fields(problem.rows) if f.name != "copy"}
+    rows = {
+        f.name: np.array(getattr(problem.rows, f.name))
+        for f in fields(problem.rows)
+        if f.name != "copy"
+    }
     return rows, problem.b + problem.jacobian @ problem.rows.v_free.ravel()
 
 
@@ -31,7 +35,12 @@ def made(problem, rows, target):
     kj = problem.rows.n_joints
     mj = len(rows["jac"])
     return lv.Problem.from_rows(
-        lv.Rows(**rows), target, lower=c.lower[:mj], upper=c.upper[:mj], mu=c.mu[kj:], tangents=c.n_tangents[kj:]
+        lv.Rows(**rows),
+        target,
+        lower=c.lower[:mj],
+        upper=c.upper[:mj],
+        mu=c.mu[kj:],
+        tangents=c.n_tangents[kj:],
     )
 
 
@@ -52,7 +61,9 @@ def test_diagnose_of_opposed_or_repeated_contacts_reports_them(name):
         for key in ("contact_body", "tangent", "arm_a", "arm_b"):
             twice[key] = np.concatenate([rows[key], rows[key][-1:]])
         second = np.cross(rows["normal"][-1:], rows["tangent"][-1:])
-        for angle in (0.0, 0.3) if sign < 0.0 else (0.0,):  # [rad] Normals that are nearly opposite contradict, too.
+        for angle in (
+            (0.0, 0.3) if sign < 0.0 else (0.0,)
+        ):  # [rad] Normals that are nearly opposite contradict, too.
             normal = np.cos(angle) * rows["normal"][-1:] + np.sin(angle) * second
             twice["normal"] = np.concatenate([rows["normal"], sign * normal])
             assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
@@ -103,7 +114,9 @@ def test_diagnose_of_wrong_row_order_in_j_reports_it():
     rows = np.arange(36).reshape(-1, 3)
     for grouped in (rows.T.ravel(), np.r_[rows[:, 0], rows[:, 1:].ravel()]):
         assert kinds(problem(j[grouped])) == {"all normals first"}
-        target = (j @ v + np.where(np.arange(36) % 12 == 0, 0.01, 0.0))[grouped]  # which does not tell the order
+        target = (j @ v + np.where(np.arange(36) % 12 == 0, 0.01, 0.0))[
+            grouped
+        ]  # which does not tell the order
         (found,) = lv.diagnose(problem(j[grouped], target=target))
         assert "if all normals come first" in found.reason
     moving = np.arange(len(mass)) % 6 < 3
@@ -112,8 +125,13 @@ def test_diagnose_of_wrong_row_order_in_j_reports_it():
         (inverse, "inverses for mass and inertia"),
         (np.where(moving[:, None] & moving, inverse, mass), "inverse mass for mass"),
     ):
-        assert kinds(problem(j, wrong)) == {"masses"} and words in lv.diagnose(problem(j, wrong))[0].reason
-    assert kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()  # one of twelve: collision detection does that
+        assert (
+            kinds(problem(j, wrong)) == {"masses"}
+            and words in lv.diagnose(problem(j, wrong))[0].reason
+        )
+    assert (
+        kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()
+    )  # one of twelve: collision detection does that
     assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
 
 
@@ -153,7 +171,11 @@ def test_diagnose_of_masses_as_inverse_masses_reports_them_in_space_only(mass, s
     corners = (-size / 2, size / 2)
     plane = lv.RowBuilder([mass], [inertia], [(0.0, -9.81 * dt, 0.0)], dt, [(0.0, size / 2)])
     space = lv.RowBuilder(
-        [mass], [inertia * np.eye(3)], [(0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0)], dt, [(0.0, 0.0, size / 2)]
+        [mass],
+        [inertia * np.eye(3)],
+        [(0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0)],
+        dt,
+        [(0.0, 0.0, size / 2)],
     )
     for x in corners:
         plane.contact(-1, 0, (x, 0.0), (0.0, 1.0), mu=0.5)
@@ -171,7 +193,9 @@ def test_diagnose_of_a_bounce_with_a_gap_reports_nothing():
 
     def found(target):
         cones = lv.Cones.contacts(0.0, tangents=0, count=2)
-        problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), fall - 9.81 * dt, target=target, cones=cones)
+        problem = lv.Problem.from_jacobian(
+            np.eye(2), np.eye(2), fall - 9.81 * dt, target=target, cones=cones
+        )
         return [s.kind for s in lv.diagnose(problem, velocity=fall, gap=gap, dt=dt)]
 
     assert found(-e * fall) == []
@@ -187,7 +211,11 @@ def pressed(law, form):
     jac = np.zeros((1, 12))
     jac[0, 8] = -1.0
     rows = replace(rows, jac=jac, joint_ptr=np.array([0, 1]), joint_body=np.array([[-1, 0]]))
-    friction = {"friction": law, "tangents": 2, "mu": 0.5} if law in ("coulomb", "cone") else {"tangents": 0}
+    friction = (
+        {"friction": law, "tangents": 2, "mu": 0.5}
+        if law in ("coulomb", "cone")
+        else {"tangents": 0}
+    )
     ends = {"lower": -np.inf, "upper": np.inf}
     target = np.zeros(1 + 2 * (1 + friction["tangents"]))
     target[1] = 0.1
@@ -207,7 +235,9 @@ def test_diagnose_of_a_conflict_names_its_blocks_and_compliance_removes_it(law, 
         assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
     (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")
     assert found.blocks == (0, 1)
-    softened = np.where(np.arange(problem.m) == 0, 1e-2 * problem.d, 0.0)  # the bounded row of the conflict
+    softened = np.where(
+        np.arange(problem.m) == 0, 1e-2 * problem.d, 0.0
+    )  # the bounded row of the conflict
     if form == "A":
         softer = replace(problem, matrix=problem.dense() + np.diag(softened))
     else:
@@ -232,7 +262,9 @@ def thin_wall(entry, as_bodies):
     cones = lv.Cones.contacts(0.0, count=2, tangents=0)
     if not as_bodies:
         jac = np.array([[entry, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        return lv.Problem.from_jacobian(jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones)
+        return lv.Problem.from_jacobian(
+            jac, 0.5 * np.eye(3), [0.2, -0.1, -0.00981], target=[0.05, 0.0], cones=cones
+        )
     jac = np.zeros((2, 12))
     jac[0, 6] = entry
     jac[1, 8] = 1.0
@@ -269,7 +301,9 @@ def test_diagnose_limit_of_impulses_grows_with_the_rows(copies):
     """An impulse counts if it pushes with max(1, rows / 100) 1e4 times the sum of M_jj max(|v*_j|, |b|)."""
     one = thin_wall(1.0, False).generalized
     for factor, reported in ((0.5, False), (2.0, True)):
-        momentum = copies * 0.5 * (0.2 + 0.15 + 0.15)  # kg m/s; the walls move out of the way with |b| = 0.15 m/s
+        momentum = (
+            copies * 0.5 * (0.2 + 0.15 + 0.15)
+        )  # kg m/s; the walls move out of the way with |b| = 0.15 m/s
         push = factor * 1e4 * max(1.0, 2 * copies / 100) * momentum
         jac = np.kron(np.eye(copies), one.jac.toarray())
         jac[0, 0] = 0.05 * 0.5 / push
@@ -289,7 +323,9 @@ def test_diagnose_asks_for_forces_only_if_a_time_step_makes_impulses_of_them():
     """A heavy body on a light one: 1 % off, the impulses err more than the zero impulse, and are no forces."""
     jac = np.array([[1.0, 0.0], [-1.0, 1.0]])
     mass = np.diag([1.0, 1e6])
-    problem = lv.Problem.from_jacobian(jac, mass, [-0.1, -0.1], cones=lv.Cones.bounded(np.zeros(2), np.full(2, np.inf)))
+    problem = lv.Problem.from_jacobian(
+        jac, mass, [-0.1, -0.1], cones=lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+    )
     solved = lv.solve(problem, tol=1e-12).impulse
     near = solved * [1.0, 1.01]
     assert lv.residual(problem, near).relative > 50.0

@@ -12,21 +12,48 @@ from vectors import METHODS, make_problem_view
 from lavender.export import HEADER
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
-SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
-COUNTS = ("form", "law", "n_blocks", "n_rows", "n_entries", "n_bodies", "n_joints", "n_velocities", "n_mass_entries")
+SWEEPS = (
+    "sequential_impulses",
+    "pgs",
+    "block_gauss_seidel",
+    "anderson",
+    "nncg",
+)  # under friction too
+COUNTS = (
+    "form",
+    "law",
+    "n_blocks",
+    "n_rows",
+    "n_entries",
+    "n_bodies",
+    "n_joints",
+    "n_velocities",
+    "n_mass_entries",
+)
 
 
 def functions(header):
     """Return (type, name, arguments) of every function of the header."""
-    found = re.findall(r"LAV_API ((?:const )?\w+ \*?)(\w+)\((.*?)\);", strip_comments(header), re.DOTALL)
+    found = re.findall(
+        r"LAV_API ((?:const )?\w+ \*?)(\w+)\((.*?)\);", strip_comments(header), re.DOTALL
+    )
     return [
-        (kind.strip(), name, [] if args.strip() == "void" else [" ".join(a.split()) for a in args.split(",")])
+        (
+            kind.strip(),
+            name,
+            [] if args.strip() == "void" else [" ".join(a.split()) for a in args.split(",")],
+        )
         for kind, name, args in found
     ]
 
 
 def _struct(name):
-    kinds = {"int32_t": ct.c_int32, "uint32_t": ct.c_uint32, "uint64_t": ct.c_uint64, "double": ct.c_double}
+    kinds = {
+        "int32_t": ct.c_int32,
+        "uint32_t": ct.c_uint32,
+        "uint64_t": ct.c_uint64,
+        "double": ct.c_double,
+    }
     fields = []
     for kind, field in parse_struct_fields(HEADER.read_text(), name):
         fields.append((field, Verdict if kind == "lav_verdict" else kinds.get(kind, ct.c_void_p)))
@@ -34,7 +61,9 @@ def _struct(name):
 
 
 Verdict, Motion = _struct("lav_verdict"), _struct("lav_motion")
-Problem, Options, Budget, Result = (_struct(f"lav_{name}") for name in ("problem", "options", "budget", "result"))
+Problem, Options, Budget, Result = (
+    _struct(f"lav_{name}") for name in ("problem", "options", "budget", "result")
+)
 
 
 class Library:
@@ -91,7 +120,11 @@ class Library:
             memory = (ct.c_double * ((workspace.value + extra) // 8 + 2))()
             solver = ct.c_void_p()
             code = self.c.lav_open(
-                memory, ct.c_uint64(ct.sizeof(memory)), ct.byref(problem), ct.byref(options), ct.byref(solver)
+                memory,
+                ct.c_uint64(ct.sizeof(memory)),
+                ct.byref(problem),
+                ct.byref(options),
+                ct.byref(solver),
             )
             if code:
                 raise Refused(self, code)
@@ -133,7 +166,9 @@ class Solver:
 
     def impulse(self):
         out = np.zeros(self.m)
-        code = self.library.c.lav_impulse(self.at, out.ctypes.data_as(ct.c_void_p), ct.c_int32(self.m))
+        code = self.library.c.lav_impulse(
+            self.at, out.ctypes.data_as(ct.c_void_p), ct.c_int32(self.m)
+        )
         if code:
             raise Refused(self.library, code)
         return out
@@ -141,6 +176,8 @@ class Solver:
 
 def run(*command, **more):
     """What a command prints; it has to succeed."""
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **more)
+    done = subprocess.run(
+        [str(c) for c in command], capture_output=True, text=True, check=False, **more
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

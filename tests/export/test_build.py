@@ -25,7 +25,11 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "c"
 TOWER = EXAMPLES / "tower.c"
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 # The first and the last that are promised; the library is compiled as C11 wherever it is run.
-LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17": ["-std=c++17", "-x", "c++"]}
+LANGUAGES = {
+    "C99": ["-std=c99"],
+    "C++11": ["-std=c++11", "-x", "c++"],
+    "C++17": ["-std=c++17", "-x", "c++"],
+}
 
 
 @pytest.mark.slow
@@ -39,11 +43,15 @@ LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17":
         pytest.param("clang", "C++11", ["-DLAV_SWEEPS_ONLY"], marks=pytest.mark.nightly),
     ],
 )
-def test_exported_library_compiles_without_warnings_in_c_and_cpp(folder, tmp_path, name, language, small):
+def test_exported_library_compiles_without_warnings_in_c_and_cpp(
+    folder, tmp_path, name, language, small
+):
     command = [name]
     quick = ["-fsyntax-only"]
     if name == "clang" and shutil.which(name) is None:  # zig's compiler is clang's
-        pytest.importorskip("ziglang", reason="neither clang nor ziglang is installed (extra: wasm)")
+        pytest.importorskip(
+            "ziglang", reason="neither clang nor ziglang is installed (extra: wasm)"
+        )
         command = [sys.executable, "-m", "ziglang", "cc", "-Wno-unused-command-line-argument"]
         quick = ["-O0", "-fno-sanitize=undefined", "-c", "-o", tmp_path / "l.o"]
     elif shutil.which(name) is None:
@@ -59,7 +67,9 @@ def test_exported_c_needs_only_sqrt_and_moves_of_memory(folder, shared):
     ours = {"sqrt", "floor", "ceil", "memcpy", "memset", "memmove"}
     assert {name for name in wanted if not name.startswith("_")} <= ours
     given = {line.split()[-1] for line in run("nm", "-D", "--defined-only", shared).splitlines()}
-    assert {name for _, name, _ in functions(export.HEADER.read_text())} == {n for n in given if n.startswith("lav_")}
+    assert {name for _, name, _ in functions(export.HEADER.read_text())} == {
+        n for n in given if n.startswith("lav_")
+    }
 
 
 @pytest.mark.parametrize(
@@ -75,7 +85,10 @@ def test_exported_c_needs_only_sqrt_and_moves_of_memory(folder, shared):
 )
 def test_c_library_with_flags_that_change_numbers_does_not_compile(folder, compiler, flag, sign):
     done = subprocess.run(
-        [compiler, flag, "-fsyntax-only", folder / "lavender.c"], capture_output=True, text=True, check=False
+        [compiler, flag, "-fsyntax-only", folder / "lavender.c"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode and sign in done.stderr
 
@@ -127,15 +140,30 @@ def test_cmake_builds_installs_and_is_found(folder, tmp_path):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name, what", [("gcc", "address,undefined"), ("clang", "memory")])
 def test_c_library_passes_sanitizers(folder, tmp_path, name, what):
-    flags = ["-std=c11", "-O0", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
-    if name == "gcc":  # a third of the time to compile: calls in place of code, a signal in place of words
-        flags += ["-fno-sanitize=null,object-size,pointer-overflow", "-fsanitize-undefined-trap-on-error"]
+    flags = [
+        "-std=c11",
+        "-O0",
+        "-g1",
+        f"-fsanitize={what}",
+        "-fno-sanitize-recover=all",
+        "-I",
+        folder,
+    ]
+    if (
+        name == "gcc"
+    ):  # a third of the time to compile: calls in place of code, a signal in place of words
+        flags += [
+            "-fno-sanitize=null,object-size,pointer-overflow",
+            "-fsanitize-undefined-trap-on-error",
+        ]
         flags += ["--param=asan-instrumentation-with-call-threshold=0"]
     (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
     if (
         shutil.which(name) is None
         or subprocess.run(
-            [name, *flags, tmp_path / "empty.c", "-o", tmp_path / "empty"], check=False, capture_output=True
+            [name, *flags, tmp_path / "empty.c", "-o", tmp_path / "empty"],
+            check=False,
+            capture_output=True,
         ).returncode
     ):
         pytest.skip(f"no {name} with -fsanitize={what}")
@@ -155,11 +183,18 @@ def write_vectors(out):
         (lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, 0.5]), "direct", {}),
         (rp.random_contact_problem(6), "auto", {}),
         (rp.random_contact_problem(7), "admm", {}),
-        *((of_matrix(given), "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
+        *(
+            (of_matrix(given), "nncg", {})
+            for given in kinds_of("cone", mu=0.0)
+            if given.rows is None
+        ),
         (rp.random_lcp(3, m=8), "lemke", {}),
         (rp.random_lcp(3, m=8), "newton", {}),
     ]
-    packed = [vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]
+    packed = [
+        vectors.make_test_vector(problem, solver, 1e-6, 500, options)[0]
+        for problem, solver, options in given
+    ]
     (out / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(packed)
 
@@ -169,12 +204,16 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     link = [CHECK, shared, f"-Wl,-rpath,{shared.parent}"]
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
-    assert len(re.findall("^same ", said, re.MULTILINE)) == count - 2  # `admm`, `auto` are held to the residual
+    assert (
+        len(re.findall("^same ", said, re.MULTILINE)) == count - 2
+    )  # `admm`, `auto` are held to the residual
     assert len(re.findall("^met ", said, re.MULTILINE)) == 2
     data = bytearray((tmp_path / "vectors.bin").read_bytes())
     data[-8] ^= 1  # the last bit of the last impulse
     (tmp_path / "vectors.bin").write_bytes(data)
-    done = subprocess.run([tmp_path / "check"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [tmp_path / "check"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1 and "DIFFERS" in done.stdout
 
 
@@ -188,14 +227,18 @@ def test_examples_of_the_library_run(folder, shared, compiler, tmp_path, monkeyp
     assert len(found) == 240 and lv.solve(found[-1], "newton").success
     monkeypatch.chdir(shared.parent)
     output = run(sys.executable, EXAMPLES / "lcp_ctypes.py")
-    np.testing.assert_allclose(np.fromstring(output.strip("[] \n"), sep=" "), [0.5, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        np.fromstring(output.strip("[] \n"), sep=" "), [0.5, 0.0], atol=1e-15
+    )
 
 
 @pytest.mark.slow
 def test_example_box2d_with_its_solver_replaced_runs(folder, tmp_path):
     sources = os.environ.get("LAVENDER_BOX2D")
     if not sources or shutil.which("cmake") is None:
-        pytest.skip("needs cmake, and LAVENDER_BOX2D that names a folder with the sources of Box2D v3")
+        pytest.skip(
+            "needs cmake, and LAVENDER_BOX2D that names a folder with the sources of Box2D v3"
+        )
     example = Path(__file__).resolve().parents[2] / "examples" / "box2d"
     run("cmake", "-S", example, "-B", tmp_path, f"-DBOX2D={sources}", f"-DLAVENDER={folder}")
     run("cmake", "--build", tmp_path)

@@ -61,13 +61,20 @@ def planar(folder, compiler, compiled, tmp_path_factory):
 
 def test_planar_engine_disks_on_a_slope_roll_by_the_closed_form(planar):
     speed, spin = (float(planar[0].split(name)[1].split()[0]) for name in ("speed", "spin"))
-    assert speed == pytest.approx(2 / 3 * 9.81 * math.sin(0.3) * 1.0, rel=1e-9)  # a = 2/3 g sin(slope), 1 s
+    assert speed == pytest.approx(
+        2 / 3 * 9.81 * math.sin(0.3) * 1.0, rel=1e-9
+    )  # a = 2/3 g sin(slope), 1 s
     assert spin == pytest.approx(-speed / 0.5, rel=1e-9)
 
 
 def test_c_example_dumped_answer_is_judged_as_its_impulse(planar):
     lines = [json.loads(line) for line in (planar[1] / "engine.jsonl").read_text().splitlines()]
-    assert len(lines) == 60 and lines[7] == {"file": "step_007.npz", "rows": 6, "seconds": 0, "solver": "own PGS"}
+    assert len(lines) == 60 and lines[7] == {
+        "file": "step_007.npz",
+        "rows": 6,
+        "seconds": 0,
+        "solver": "own PGS",
+    }
     stored = read_npz(planar[1] / "step_007.npz")
     assert lv.residual(stored.problem, stored.impulse).relative < 1e-12  # 200 sweeps of six rows
     assert np.abs(stored.impulse).max() > 0.1
@@ -77,7 +84,17 @@ def test_cpp_header_moves_judges_and_throws_the_named_array(folder, compiler, co
     if shutil.which("g++") is None:
         pytest.skip("no g++")
     (tmp_path / "wrapped.cpp").write_text(WRAPPED)
-    run("g++", "-std=c++20", *WARNINGS, "-I", folder, tmp_path / "wrapped.cpp", compiled, "-o", tmp_path / "wrapped")
+    run(
+        "g++",
+        "-std=c++20",
+        *WARNINGS,
+        "-I",
+        folder,
+        tmp_path / "wrapped.cpp",
+        compiled,
+        "-o",
+        tmp_path / "wrapped",
+    )
     lines = run(tmp_path / "wrapped").splitlines()
     assert lines[:2] == ["0.5 0 0 1.5 0", "-14"]
     assert lines[2].startswith("lower[1]: lower > upper")

@@ -48,7 +48,9 @@ def test_c_engine_steps_and_images_have_the_bits_of_the_package(library, name):
             assert library.c.lav_engine_image(at, image, size, ct.byref(size)) == 0
             at, memory = opened(library, bytes(image))
         said = simulation.step()[0]["solver"]
-        code = library.c.lav_engine_step(at, scene.parameters.substeps, ct.c_void_p(values.ctypes.data))
+        code = library.c.lav_engine_step(
+            at, scene.parameters.substeps, ct.c_void_p(values.ctypes.data)
+        )
         assert code == 0, library.c.lav_text(code)
         assert values.tobytes() == said.tobytes()
         assert places(library, at).tobytes() == of_package(simulation).tobytes()
@@ -59,7 +61,22 @@ def test_c_engine_image_with_a_changed_bit_is_rejected(library):
     image = bytearray(engine_image(lv.Simulation(lv.Scene("stack"))))
     workspace = ct.c_uint64()
     image[len(image) // 2] ^= 4
-    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -4
-    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image) - 8), ct.byref(workspace)) == -3
+    assert (
+        library.c.lav_engine_workspace_size(
+            bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)
+        )
+        == -4
+    )
+    assert (
+        library.c.lav_engine_workspace_size(
+            bytes(image), ct.c_uint64(len(image) - 8), ct.byref(workspace)
+        )
+        == -3
+    )
     image[0] ^= 1
-    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -2
+    assert (
+        library.c.lav_engine_workspace_size(
+            bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)
+        )
+        == -2
+    )

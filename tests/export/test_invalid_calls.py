@@ -18,7 +18,9 @@ import lavender as lv
 from lavender.export import HEADER
 
 ERRORS = {
-    value: name for name, value in parse_enum_constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")
+    value: name
+    for name, value in parse_enum_constants(HEADER.read_text()).items()
+    if name.startswith("LAV_ERROR")
 }
 CANARY = 0xA5
 
@@ -33,7 +35,11 @@ class Guarded:
         self.at = ct.c_void_p()
         begin = ct.addressof(self.memory) + 128
         self.code = self.c.lav_open(
-            ct.c_void_p(begin), ct.c_uint64(bytes_), ct.byref(problem), ct.byref(options), ct.byref(self.at)
+            ct.c_void_p(begin),
+            ct.c_uint64(bytes_),
+            ct.byref(problem),
+            ct.byref(options),
+            ct.byref(self.at),
         )
 
     def is_intact(self):
@@ -107,14 +113,19 @@ MISTAKES = {
     "rolling below 0": (set_array("rolling", [-0.1] * 12), "FRICTION"),
     "rolling not a number": (set_array("rolling", [np.nan] * 12), "FRICTION"),
     "rows that do not roll": (change("kind", 2, 5), "BLOCKS"),
-    "a box of one tangent": (lambda q: (change("kind", 2, 4)(q), change("block_ptr", 3, 8)(q)), "BLOCKS"),
+    "a box of one tangent": (
+        lambda q: (change("kind", 2, 4)(q), change("block_ptr", 3, 8)(q)),
+        "BLOCKS",
+    ),
     "an order with a block twice": (change("order", 1, 0), "INDEX"),
 }
 
 
 #: Mistakes of several numbers, with their count: any of these is named.
 INEXACT_PLACES = {
-    **dict.fromkeys(("a normal of length 0", "a normal of length 2", "a tangent along the normal"), 3),
+    **dict.fromkeys(
+        ("a normal of length 0", "a normal of length 2", "a tangent along the normal"), 3
+    ),
     **dict.fromkeys(("an inertia below 0", "an inertia that is not symmetric"), 9),
     "two static bodies": 2,
 }
@@ -137,15 +148,21 @@ def test_c_library_of_an_invalid_problem_returns_the_array_and_index_of_its_faul
         size = INEXACT_PLACES.get(mistake, 1)
         assert at.value // size == apply.index % problem.keep[apply.array].size // size
         if apply.array in ROWS:  # as the package refuses it
-            arrays = {name: problem.keep[name] for name in ROWS} | {"v_free": problem.keep["velocity"]}
+            arrays = {name: problem.keep[name] for name in ROWS} | {
+                "v_free": problem.keep["velocity"]
+            }
             with pytest.raises(lv.InputError, match=apply.array):
                 lv.Rows(**arrays)
     assert solver.is_intact()
     result = Result()
     result.size = ct.sizeof(Result)
     budget = library.budget(5, 0.0)
-    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(result)) == -14  # not the problem before
-    assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
+    assert (
+        library.c.lav_run(solver.at, ct.byref(budget), ct.byref(result)) == -14
+    )  # not the problem before
+    assert (
+        library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0
+    )  # and goes on
 
 
 def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_errors(library):
@@ -153,8 +170,17 @@ def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_erro
     q = Problem()
     o = Options()
     r = Result()
-    assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
-    assert c.lav_workspace_size(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
+    assert (
+        c.lav_set(None, ct.byref(q))
+        == c.lav_run(None, None, None)
+        == c.lav_impulse(None, None, 0)
+        == -1
+    )
+    assert (
+        c.lav_workspace_size(None, None, None)
+        == c.lav_open(None, ct.c_uint64(8), None, None, None)
+        == -1
+    )
     nobody = (ct.c_double * 400)()
     assert c.lav_set(nobody, ct.byref(q)) == -15
     assert c.lav_default_options(99, ct.byref(o)) == c.lav_default_problem(0, ct.byref(q)) == -12
@@ -177,7 +203,9 @@ def test_c_library_of_null_and_of_memory_without_a_solver_returns_different_erro
     assert solver.is_intact()
 
 
-@pytest.mark.parametrize("method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"])
+@pytest.mark.parametrize(
+    "method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"]
+)
 def test_c_library_with_too_little_memory_returns_an_error_and_writes_inside_it(library, method):
     problem = library.problem(self_test_problem())
     options = library.options(method)
@@ -207,8 +235,15 @@ def test_c_solver_moved_to_more_memory_takes_a_larger_problem(library, method):
     free = lv.Problem.linear(np.eye(3) + 0.01, rng.normal(size=3))
     towers = [stack_of(n) for n in (1, 6)]
     grown = 0
-    for few, many in ((free, more), (small, random_lcp(2, m=60)), (as_matrix(bodies), as_matrix(towers[1])), towers):
-        problems = [library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)]
+    for few, many in (
+        (free, more),
+        (small, random_lcp(2, m=60)),
+        (as_matrix(bodies), as_matrix(towers[1])),
+        towers,
+    ):
+        problems = [
+            library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)
+        ]
         options = library.options(method)
         if any(c.lav_takes(ct.byref(q), ct.byref(options)) for q in problems):
             continue
@@ -226,9 +261,13 @@ def test_c_solver_moved_to_more_memory_takes_a_larger_problem(library, method):
             solver.memory = memory
             asked = asked + 1
             code = solver.set(problems[1])
-        assert code == 0 and asked <= (1 if method in (*SWEEPS, "sor", "gauss_seidel", "jacobi") else 3)
+        assert code == 0 and asked <= (
+            1 if method in (*SWEEPS, "sor", "gauss_seidel", "jacobi") else 3
+        )
         grown += asked
-        same = int(np.searchsorted(many.cones.ptr, few.m, side="right")) - 1  # blocks of the same keys
+        same = (
+            int(np.searchsorted(many.cones.ptr, few.m, side="right")) - 1
+        )  # blocks of the same keys
         if np.array_equal(many.cones.kind[:same], few.cones.kind[:same]) and same == few.n_blocks:
             assert solver.impulse()[: few.m].tobytes() == before.tobytes()
     assert grown
@@ -339,7 +378,9 @@ def test_c_library_on_drawn_problems_writes_inside_its_memory(library, data):
     assert solver.is_intact()
 
 
-@pytest.mark.parametrize("method, tol", [("sequential_impulses", 0.1), ("anderson", 0.01), ("nncg", 0.01)])
+@pytest.mark.parametrize(
+    "method, tol", [("sequential_impulses", 0.1), ("anderson", 0.01), ("nncg", 0.01)]
+)
 def test_c_library_budget_that_ends_within_tol_has_converged(library, method, tol):
     problem = self_test_problem()
     for n in range(1, 40):
@@ -355,7 +396,10 @@ def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, fold
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
     made += [f"{name} = {value}" for name, value in parse_enum_constants(header).items()]
     for name in STRUCTS:
-        made += [f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(parse_struct_fields(header, name))]
+        made += [
+            f"{name}[{i}] {kind} {field}"
+            for i, (kind, field) in enumerate(parse_struct_fields(header, name))
+        ]
     kept = (Path(__file__).parent / "abi.txt").read_text().splitlines()
     lost = [line for line in kept if line not in made]
     assert not lost, "what a release had is gone or is another"
@@ -364,5 +408,9 @@ def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, fold
     library.c.lav_default_options(1, ct.byref(options))
     assert (problem.size, options.size) == (ct.sizeof(Problem), ct.sizeof(Options))
     assert library.budget(1, 0.0).size == ct.sizeof(type(library.budget(1, 0.0)))
-    names = {re.split(r"[ *]", line.split("(")[0])[-1] for line in kept if "(" in line and "[" not in line}
+    names = {
+        re.split(r"[ *]", line.split("(")[0])[-1]
+        for line in kept
+        if "(" in line and "[" not in line
+    }
     assert all(hasattr(library.c, name) for name in names)

@@ -28,17 +28,23 @@ def problems():
         yield lv.Problem.contact(a, rng.normal(size=m), rng.uniform(0.2, 0.8, size=m // 3))
         yield rp.random_contact_problem(seed)
         yield rp.random_contact_problem(seed, "cone")
-    yield rp.random_contact_problem(9, bodies=20, joints=6, contacts=40)  # enough blocks to be swept in pairs
+    yield rp.random_contact_problem(
+        9, bodies=20, joints=6, contacts=40
+    )  # enough blocks to be swept in pairs
     yield lv.suite.box_stack(3).problem
     for friction in ("coulomb", "cone"):
         rng = np.random.default_rng(7)
         root = np.diag(rng.uniform(1.0, 2.0, size=4))  # so few that sweeps go over J
         jac = rng.normal(size=(9, 4))
         cones = lv.Cones.contacts(0.5, count=3)
-        yield lv.Problem.from_jacobian(jac, root, rng.normal(size=4), cones=cones, friction=friction)
+        yield lv.Problem.from_jacobian(
+            jac, root, rng.normal(size=4), cones=cones, friction=friction
+        )
         yield ill_conditioned(7, friction)
         yield from kinds_of(friction)
-        yield from kinds_of(friction, mu=0.0)  # the law is what sweeps know, not how rough a contact is
+        yield from kinds_of(
+            friction, mu=0.0
+        )  # the law is what sweeps know, not how rough a contact is
 
 
 def ill_conditioned(seed, friction):
@@ -63,7 +69,9 @@ def kinds_of(friction, mu=0.4):
         cones = lv.Cones.contacts(mu, count=3, **given)
         jac = rng.normal(size=(3 * rows, 20))
         yield lv.Problem(rng.normal(size=3 * rows), cones, jac @ jac.T, friction=friction)
-        yield lv.Problem.from_jacobian(jac[:, :4], np.eye(4), rng.normal(size=4), cones=cones, friction=friction)
+        yield lv.Problem.from_jacobian(
+            jac[:, :4], np.eye(4), rng.normal(size=4), cones=cones, friction=friction
+        )
 
 
 def is_formed(given, found):
@@ -80,10 +88,16 @@ def dense_velocities():
         rng = np.random.default_rng(seed)
         root = rng.normal(size=(24, 24))
         m = 9 * (1 + seed)
-        cones = lv.Cones.contacts(0.5, count=m // 3) if seed else lv.Cones.contacts(0.0, count=m, tangents=0)
+        cones = (
+            lv.Cones.contacts(0.5, count=m // 3)
+            if seed
+            else lv.Cones.contacts(0.0, count=m, tangents=0)
+        )
         jac = rng.normal(size=(m, 24))
         mass = np.eye(24) + 0.1 * root @ root.T
-        yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=24), cones=cones, friction=friction)
+        yield lv.Problem.from_jacobian(
+            jac, mass, rng.normal(size=24), cones=cones, friction=friction
+        )
 
 
 def of_matrix(given):
@@ -105,7 +119,11 @@ def test_methods_are_numbered_and_named_as_in_the_header(library):
     assert sorted(METHODS.values()) == list(range(1, 13))
     for name, number in METHODS.items():
         assert library.c.lav_name(number).decode() == name
-    row = next(line for line in (ROOT / "docs" / "c.md").read_text().splitlines() if line.startswith("| methods |"))
+    row = next(
+        line
+        for line in (ROOT / "docs" / "c.md").read_text().splitlines()
+        if line.startswith("| methods |")
+    )
     assert sorted(re.findall(r"`(\w+)`", row)) == sorted(METHODS)
 
 
@@ -134,14 +152,19 @@ def test_c_library_method_has_the_bits_of_the_package(library, at):
         if name == "newton" and given.generalized is None:
             wanted, factorisations = run_compiled_newton(given, tol, n)
             said = solver.run(n, tol)
-            assert (solver.impulse().tobytes(), said.iterations) == (wanted.tobytes(), factorisations)
+            assert (solver.impulse().tobytes(), said.iterations) == (
+                wanted.tobytes(),
+                factorisations,
+            )
             continue
         found = lv.solve(given, name, tol=tol, max_iter=n, impulse=start)
         case = (name, n, tol, found.solver.form)
         ran += 1
         if is_formed(given, found):
             formed += 1
-            solver = library.open(library.problem(of_matrix(given), impulse=start), library.options(name))
+            solver = library.open(
+                library.problem(of_matrix(given), impulse=start), library.options(name)
+            )
             solver.run(n, tol)
             if tol == 0.0:  # the judge, who ends it, reads the problem as it is given
                 assert solver.impulse().tobytes() == found.impulse.tobytes(), case
@@ -152,7 +175,10 @@ def test_c_library_method_has_the_bits_of_the_package(library, at):
         assert said.verdict.floor == found.residual.roundoff_floor, case
         assert said.verdict.worst == found.residual.worst_row, case
         assert tol == 0.0 or (said.outcome == 1) == (said.verdict.relative <= tol), case
-        assert said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
+        assert (
+            said.verdict.energy == found.residual.energy
+            and said.verdict.velocity == found.residual.velocity
+        )
         if (tol or name == "lemke") and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case
     assert ran >= 4 and (formed or at < len(GIVEN))
@@ -160,7 +186,13 @@ def test_c_library_method_has_the_bits_of_the_package(library, at):
 
 @pytest.mark.parametrize(
     ("name", "friction"),
-    [("pgs", "coulomb"), ("block_gauss_seidel", "cone"), ("anderson", "coulomb"), ("nncg", "cone"), ("newton", "cone")],
+    [
+        ("pgs", "coulomb"),
+        ("block_gauss_seidel", "cone"),
+        ("anderson", "coulomb"),
+        ("nncg", "cone"),
+        ("newton", "cone"),
+    ],
 )
 def test_c_library_claims_on_ill_conditioned_mass_are_those_of_the_package(library, name, friction):
     """The residual is refined in the library as well: with the package's status, and at its floor where it is."""
@@ -171,7 +203,10 @@ def test_c_library_claims_on_ill_conditioned_mass_are_those_of_the_package(libra
         solver = library.open(problem, library.options(name))
         said = solver.run(100_000, 1e-9)
         judged = lv.residual(given, solver.impulse(), tol=1e-9)
-        assert (said.verdict.relative, said.verdict.floor) == (judged.relative, judged.roundoff_floor)
+        assert (said.verdict.relative, said.verdict.floor) == (
+            judged.relative,
+            judged.roundoff_floor,
+        )
         if said.outcome == 4:
             assert judged.relative > 1e-9 and judged.at_floor
             count += 1
@@ -190,7 +225,11 @@ def test_vectors_are_of_methods_that_the_library_takes(library):
             except lv.CapabilityError:
                 continue
             code = library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name)))
-            assert is_accepted_by_library(given, name) == (code == 0), (name, given.law, given.cones.kind)
+            assert is_accepted_by_library(given, name) == (code == 0), (
+                name,
+                given.law,
+                given.cones.kind,
+            )
             looked.add((name, code))
     assert len(looked) > len(METHODS)
 
@@ -210,7 +249,9 @@ def test_options_equal_the_options_of_the_package(library, method, asked, words)
     given = self_test_problem()
     found = lv.solve(given, method, tol=0, max_iter=25, **words)
     solver = library.open(library.problem(given), library.options(method, **asked))
-    for n in (25,) if method == "anderson" else (10, 15):  # runs of sweeps go on where the last one ended
+    for n in (
+        (25,) if method == "anderson" else (10, 15)
+    ):  # runs of sweeps go on where the last one ended
         solver.run(n, 0.0)
     assert solver.impulse().tobytes() == found.impulse.tobytes()
 
@@ -220,7 +261,9 @@ def test_c_workspace_size_exceeds_the_need_by_at_most_five_percent(library, meth
     looked = 0
     for given in GIVEN:
         problem, options = library.problem(given), library.options(method)
-        if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
+        if given.generalized is not None or library.c.lav_takes(
+            ct.byref(problem), ct.byref(options)
+        ):
             continue
         workspace = library.workspace(problem, options).value
         solver = library.open(problem, options)
@@ -243,7 +286,10 @@ def test_c_workspace_of_pivots_counts_unmoved_bodies(library, method, n_bodies):
     )
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
     options = library.options(method)
-    assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
+    assert (
+        library.c.lav_needed(library.open(problem, options).at)
+        <= library.workspace(problem, options).value
+    )
 
 
 def test_c_library_carries_impulses_by_key(library):
@@ -268,11 +314,19 @@ def test_c_library_velocities_equal_the_package(library):
     solver.run(30, 0.0)
     out = np.zeros(18)
     assert library.c.lav_velocity(solver.at, out.ctypes.data, 18) == 0
-    np.testing.assert_allclose(out.reshape(3, 6), given.velocity(solver.impulse()), rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(
+        out.reshape(3, 6), given.velocity(solver.impulse()), rtol=0.0, atol=1e-14
+    )
 
 
 def count_islands(library, given, **arrays):
-    method = "pgs" if given.matrix is not None else "sequential_impulses" if given.rows is not None else "nncg"
+    method = (
+        "pgs"
+        if given.matrix is not None
+        else "sequential_impulses"
+        if given.rows is not None
+        else "nncg"
+    )
     solver = library.open(library.problem(given, **arrays), library.options(method))
     label = np.full(given.n_blocks, -1, np.int32)
     return library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
@@ -329,7 +383,10 @@ def row_of_boxes(n):
     along = np.tile([1.0, 0.0, 0.0], (n - 1, 1))
     normal = np.vstack([up, along])
     body = np.vstack(
-        [np.column_stack([np.full(n, -1), np.arange(n)]), np.column_stack([np.arange(n - 1), np.arange(1, n)])]
+        [
+            np.column_stack([np.full(n, -1), np.arange(n)]),
+            np.column_stack([np.arange(n - 1), np.arange(1, n)]),
+        ]
     )
     v_free = np.tile([0.0, 0.0, -0.1, 0.0, 0.0, 0.0], (n, 1))
     v_free[0, 0] = 0.02
@@ -371,7 +428,9 @@ def test_c_library_newton_on_singular_rows_ends_by_a_line_search(library):
     for seed in range(40):
         rng = np.random.default_rng(seed)
         g = rng.normal(size=(14, 6)) * 10.0 ** rng.uniform(-3, 3, size=(14, 1))
-        given = lv.Problem.lcp(g @ g.T, g @ rng.normal(size=6), upper=rng.uniform(0.1, 2.0, size=14))
+        given = lv.Problem.lcp(
+            g @ g.T, g @ rng.normal(size=6), upper=rng.uniform(0.1, 2.0, size=14)
+        )
         found = lv.solve(given, "direct", tol=1e-9)
         solver = library.open(library.problem(given), library.options("direct"))
         said = solver.run(1000, 1e-9)
@@ -400,7 +459,9 @@ def test_motion_errors_equal_the_package(library):
             continue
         looked += 1
         assert out.energy == pytest.approx(wanted.energy, rel=1e-6)
-        assert out.kinetic == pytest.approx(wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6)
+        assert out.kinetic == pytest.approx(
+            wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6
+        )
         assert out.relative == pytest.approx(wanted.relative, rel=1e-6)
         assert (out.row, out.rows) == (wanted.row, pytest.approx(wanted.rows, rel=1e-6))
         if wanted.speed is not None:
@@ -438,7 +499,17 @@ LAV_API int32_t dump(lav_solver *s, const lav_problem *q, const char *path) { re
 
 def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
     (tmp_path / "dump.c").write_text(DUMP)
-    flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED", "-fPIC", "-shared", "-I", folder]
+    flags = [
+        "-Wall",
+        "-Wextra",
+        "-Wpedantic",
+        "-Werror",
+        "-DLAV_SHARED",
+        "-fPIC",
+        "-shared",
+        "-I",
+        folder,
+    ]
     run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")
     run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", tmp_path / "dump.c")
     c = ct.CDLL(str(tmp_path / "dump.so"))
@@ -450,14 +521,22 @@ def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler
         solver = library.open(problem, library.options("block_gauss_seidel"))
         assert c.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
         found = lv.load(path)
-        assert found.b.tobytes() == given.b.tobytes() and found.cones == given.cones and found.rows == given.rows
+        assert (
+            found.b.tobytes() == given.b.tobytes()
+            and found.cones == given.cones
+            and found.rows == given.rows
+        )
         assert np.array_equal(found.key, key) and found.friction == given.friction
         velocity = problem.keep.get("velocity")
-        if velocity is not None and velocity.size:  # an engine reads v+ into the array of v* before it dumps the step
+        if (
+            velocity is not None and velocity.size
+        ):  # an engine reads v+ into the array of v* before it dumps the step
             after = np.full_like(velocity, 7.0)
             problem.velocity = after.ctypes.data
             assert c.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
-            assert lv.load(path).rows == given.rows and lv.load(path).generalized == given.generalized
+            assert (
+                lv.load(path).rows == given.rows and lv.load(path).generalized == given.generalized
+            )
             problem.velocity = velocity.ctypes.data
         again = library.open(library.problem(found), library.options("block_gauss_seidel"))
         solver.run(7, 0.0), again.run(7, 0.0)

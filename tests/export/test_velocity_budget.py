@@ -18,7 +18,9 @@ def accepted(method):
     return [p for p in problems if method in lv.available(p)]
 
 
-@pytest.mark.parametrize("velocity_tol", [1e3, 1e-2, 1e-4, 1e-7])  # 1e3 m/s: zero impulses are accepted
+@pytest.mark.parametrize(
+    "velocity_tol", [1e3, 1e-2, 1e-4, 1e-7]
+)  # 1e3 m/s: zero impulses are accepted
 @pytest.mark.parametrize("method", (*SWEEPS, "newton", "direct"))
 def test_c_library_to_a_velocity_error_has_the_bits_of_the_package(library, method, velocity_tol):
     problems = accepted(method)

@@ -42,7 +42,13 @@ OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
 #: Forms of A (1 a matrix, 2 bodies, 3 J and M) that a method supports, for methods that do not support all three.
-FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
+FORMS = {
+    "sequential_impulses": (2,),
+    "pgs": (1, 3),
+    "direct": (1, 2),
+    "lemke": (1, 2),
+    "admm": (1, 2),
+}
 FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
 
 
@@ -64,10 +70,17 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
     """Return the contents of the `lav_problem` of a problem; its start is the problem's guess, if there is one."""
     c = problem.cones
     if c.has_ellipse:
-        raise NotSupported("the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents")
+        raise NotSupported(
+            "the library has no ellipses: give it `problem.disk`, the same problem with scaled tangents"
+        )
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
-    arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
+    arrays |= {
+        "patch_radius": c.patch_radius,
+        "b": problem.b,
+        "impulse": problem.guess,
+        "rolling": c.rolling,
+    }
     form, entries, bodies, joints, velocities, mass = 1, 0, 0, 0, 0, 0
     if problem.rows is not None:
         r = problem.rows
@@ -97,7 +110,9 @@ def make_problem_view(problem: lv.Problem) -> ProblemView:
         if values is not None:
             arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
     law = int(problem.friction == "cone")
-    return ProblemView((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
+    return ProblemView(
+        (form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays
+    )
 
 
 def is_accepted_by_library(problem: lv.Problem, solver: str) -> bool:
@@ -126,7 +141,9 @@ def encode_options(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, 
     )
     omega = remaining.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
     if remaining or order not in ORDERS or solver not in METHODS:
-        unsupported = ", ".join(remaining) or (f"order={order!r}" if order not in ORDERS else solver)
+        unsupported = ", ".join(remaining) or (
+            f"order={order!r}" if order not in ORDERS else solver
+        )
         raise NotSupported(
             f"{unsupported} is not in the C library; choose a solver and options that the header lavender.h lists"
         )
@@ -154,7 +171,9 @@ class Step:
     def to_bytes(self) -> bytes:
         """Return the step in the format of check.c."""
         omega = encode_options(self.solver, self.options)[1]
-        return struct.pack("<7qdqd", *self.get_option_integers(), 0, omega, self.iterations, self.tol)
+        return struct.pack(
+            "<7qdqd", *self.get_option_integers(), 0, omega, self.iterations, self.tol
+        )
 
 
 def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
@@ -168,7 +187,9 @@ def split_into_steps(solution: lv.Solution, step: Step) -> list[Step]:
     for stage in solution.stages:
         solver = stage.solver.split()[0]
         pivots = solver in ("direct", "lemke")  # Pivoting methods need no iteration limit.
-        iterations = 0 if pivots else max((stage.work.get(kind, 0) for kind in ITERATION_COUNTS), default=0)
+        iterations = (
+            0 if pivots else max((stage.work.get(kind, 0) for kind in ITERATION_COUNTS), default=0)
+        )
         work[solver] = work.get(solver, 0) + (2 * iterations or registry.specs()[solver].max_iter)
     steps = []
     for name, count in (work or {"anderson": 1}).items():
@@ -189,7 +210,8 @@ def make_test_vector(
     solution = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
     form = solution.solver.form
     if ", then" in form or (
-        problem.matrix is None and ("rows of A" in form or (solver == "pgs" and form != "whitened J"))
+        problem.matrix is None
+        and ("rows of A" in form or (solver == "pgs" and form != "whitened J"))
     ):
         raise NotSupported(
             f"{solver} formed A of J and M, which the C library does not do: export the problem with its "
@@ -212,8 +234,12 @@ def make_test_vector(
         impulse = run_compiled_newton(problem, tol, max_iter)[0]
         relative = lv.residual(problem, impulse, tol=tol).relative
     is_met = solver in OTHER_BITS
-    out = struct.pack("<q", len(steps)) + b"".join(step.to_bytes() for step in steps) + packed_problem
-    return out + struct.pack("<qd", is_met, tol if is_met else relative) + (b"" if is_met else impulse.tobytes()), steps
+    out = (
+        struct.pack("<q", len(steps)) + b"".join(step.to_bytes() for step in steps) + packed_problem
+    )
+    return out + struct.pack("<qd", is_met, tol if is_met else relative) + (
+        b"" if is_met else impulse.tobytes()
+    ), steps
 
 
 def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[np.ndarray, int]:
@@ -228,7 +254,9 @@ def run_compiled_newton(problem: lv.Problem, tol: float, budget: int) -> tuple[n
     driver = Driver(problem.metric)
     outcome = OUTCOMES["more"]
     if not driver.fits:
-        raise NotSupported("the C library's newton does not accept this problem; choose another solver (--solver)")
+        raise NotSupported(
+            "the C library's newton does not accept this problem; choose another solver (--solver)"
+        )
     driver.start(impulse, tol, budget)
     while outcome in (OUTCOMES["more"], OUTCOMES["certificate"]):
         outcome = driver.step(10**6, impulse)

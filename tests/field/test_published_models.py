@@ -31,12 +31,16 @@ PACKAGES = (
 )
 INTEGRATORS = ("EULER", "IMPLICIT", "IMPLICITFAST", "DISCRETE")
 N_MODELS, N_STEPS, MAX_VELOCITIES = 40, 15, 80
-TOLERANCE = 1e-9  # Relative; the rounding of a solve with a mass matrix of a condition of up to 1e6.
+TOLERANCE = (
+    1e-9  # Relative; the rounding of a solve with a mass matrix of a condition of up to 1e6.
+)
 
 
 def iterate_models():
     """Yield the path and model of files with constraint rows in the first steps, packages in turn."""
-    folders = [Path(spec.origin).parent for name in PACKAGES if (spec := find_spec(name)) and spec.origin]
+    folders = [
+        Path(spec.origin).parent for name in PACKAGES if (spec := find_spec(name)) and spec.origin
+    ]
     files = [sorted(folder.rglob("*.xml")) for folder in folders]
     for i in range(max(map(len, files), default=0)):
         for path in (own[i] for own in files if i < len(own)):
@@ -47,7 +51,10 @@ def iterate_models():
                 for _ in range(5):
                     mj.mj_step(model, data)
                     n_rows += data.nefc
-            except (ValueError, mj.FatalError):  # A part of a model, or one for another version of MuJoCo.
+            except (
+                ValueError,
+                mj.FatalError,
+            ):  # A part of a model, or one for another version of MuJoCo.
                 continue
             if 0 < model.nv <= MAX_VELOCITIES and n_rows and np.abs(data.qacc).max() < 1e8:
                 yield path, model
@@ -64,7 +71,10 @@ def step_model(model, seed):
         data.ctrl[:] = rng.uniform(low, np.maximum(high, low), model.nu)
         states.append(get_state(model, data))
         mj.mj_step(model, data)
-        if data.warning[mj.mjtWarning.mjWARN_BADQACC].number or data.warning[mj.mjtWarning.mjWARN_BADQVEL].number:
+        if (
+            data.warning[mj.mjtWarning.mjWARN_BADQACC].number
+            or data.warning[mj.mjtWarning.mjWARN_BADQVEL].number
+        ):
             return np.array(states[:-1]), np.array(after)
         after.append(data.qvel.copy())
     return np.array(states), np.array(after)
@@ -81,17 +91,23 @@ def test_published_models_move_as_the_judged_answer_predicts():
         model.opt.enableflags &= ~int(mj.mjtEnableBit.mjENBL_SLEEP)
         model.opt.noslip_iterations = 0
         for name in INTEGRATORS:
-            model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{name}", mj.mjtIntegrator.mjINT_EULER)
+            model.opt.integrator = getattr(
+                mj.mjtIntegrator, f"mjINT_{name}", mj.mjtIntegrator.mjINT_EULER
+            )
             try:
                 states, after = step_model(model, n_models)
                 velocity = np.full(after.shape, np.nan)
-                lv.io.from_mujoco_many(model, states, errors="status", velocity=velocity) if len(states) else None
+                lv.io.from_mujoco_many(model, states, errors="status", velocity=velocity) if len(
+                    states
+                ) else None
             except (lv.InputError, lv.CapabilityError, mj.FatalError):
                 continue
             n_steps += len(states)
             gap = np.abs(velocity - after).max(axis=1, initial=0.0)
             size = np.maximum(np.abs(after).max(axis=1, initial=0.0), 1.0)
-            different += [(path.name, name, i, gap[i]) for i in np.flatnonzero(~(gap <= TOLERANCE * size))]
+            different += [
+                (path.name, name, i, gap[i]) for i in np.flatnonzero(~(gap <= TOLERANCE * size))
+            ]
     if not n_models:
         pytest.skip("no package with published models is installed")
     print(f"{n_steps} steps of {n_models} models")

@@ -32,13 +32,17 @@ def make_paths(noise):
     rows = np.array([[-1.0, 0.0, -1.0], [1.0, -1.0, 0.0]])
     cost = np.array([1.0, 1.0, 3.0])
     free = np.zeros(3)
-    return lv.Problem.from_qp(np.zeros((3, 3)), cost, A=rows, b=np.array([-1.0, noise]), lb=free, ub=free + 10.0)
+    return lv.Problem.from_qp(
+        np.zeros((3, 3)), cost, A=rows, b=np.array([-1.0, noise]), lb=free, ub=free + 10.0
+    )
 
 
 def make_vertex(regularisation):
     """The cheapest of three shares of 1."""
     cost = np.array([1.0, 2.0, 3.0])
-    return lv.Problem.from_qp(regularisation * np.eye(3), cost, A=np.ones((1, 3)), b=[1.0], lb=np.zeros(3))
+    return lv.Problem.from_qp(
+        regularisation * np.eye(3), cost, A=np.ones((1, 3)), b=[1.0], lb=np.zeros(3)
+    )
 
 
 def make_constant_force(size):
@@ -46,12 +50,16 @@ def make_constant_force(size):
     rng = np.random.default_rng(0)
     half = rng.standard_normal((10, 10))
     cones = lv.Cones.bounded([1.0], [1.0]) + lv.Cones.contacts(np.full(3, 0.5))
-    return lv.Problem(size * rng.standard_normal(10), cones, half @ half.T + 0.1 * np.eye(10), friction="cone")
+    return lv.Problem(
+        size * rng.standard_normal(10), cones, half @ half.T + 0.1 * np.eye(10), friction="cone"
+    )
 
 
 def drop_box(inside, restitution):
     """A box that meets the floor at 3 m/s with four points, inside of its corners by this share."""
-    builder = lv.RowBuilder([1.0], [6.0 * np.eye(3)], [[0, 0, -3.0, 0, 0, 0]], 1 / 60, position=[(0, 0, 0.5)])
+    builder = lv.RowBuilder(
+        [1.0], [6.0 * np.eye(3)], [[0, 0, -3.0, 0, 0, 0]], 1 / 60, position=[(0, 0, 0.5)]
+    )
     for x in (-0.5, 0.5):
         for y in (-0.5, 0.5):
             point = (inside * x, inside * y, 0.0)
@@ -63,7 +71,9 @@ def make_finger(points):
     """A finger that cannot turn and rests on a table with four points: each has the same row."""
     jac = np.tile(np.eye(3)[[2, 0, 1]], (points, 1))
     free = np.array([0.1, 0.0, -0.1])
-    return lv.Problem.from_jacobian(jac, np.eye(3), free, cones=lv.Cones.contacts(np.full(points, 0.5)))
+    return lv.Problem.from_jacobian(
+        jac, np.eye(3), free, cones=lv.Cones.contacts(np.full(points, 0.5))
+    )
 
 
 REPORTS = [
@@ -176,7 +186,9 @@ def test_start_with_a_higher_objective_than_nothing_is_replaced_by_every_call():
         jac = rng.standard_normal((3 * contacts, n))
         free = rng.standard_normal(n)
         mu = np.full(contacts, 0.5)
-        problem = lv.Problem.from_jacobian(jac, np.eye(n), free, cones=lv.Cones.contacts(mu), friction="cone")
+        problem = lv.Problem.from_jacobian(
+            jac, np.eye(n), free, cones=lv.Cones.contacts(mu), friction="cone"
+        )
         start = np.tile([1e3, 100.0, -100.0], contacts)
         assert 0.5 * start @ problem.dense() @ start > problem.b @ start
         calls = (

@@ -86,7 +86,8 @@ def test_solve_with_arrays_of_other_libraries_gives_the_same_answers(wrap):
     np.testing.assert_array_equal(many.impulse, expected.impulse)
     batch = lv.Batch(*ARRAYS.values(), cones=CONES)
     np.testing.assert_array_equal(
-        lv.residual_many(batch, wrap(many.impulse.copy())).relative, lv.residual_many(batch, many.impulse).relative
+        lv.residual_many(batch, wrap(many.impulse.copy())).relative,
+        lv.residual_many(batch, many.impulse).relative,
     )
     problem = lv.Problem.lcp(wrap(np.eye(2)), wrap(np.ones(2)))
     assert lv.solve(problem, tol=1e-9).impulse.tolist() == pytest.approx([1.0, 1.0])
@@ -106,7 +107,9 @@ def test_solve_with_device_arrays_copies_them_once():
 
 
 def test_solve_with_an_unreadable_array_raises_its_name():
-    with pytest.raises(lv.InputError, match=r"J is a UnreadableArray on device cuda:0 that cannot be read"):
+    with pytest.raises(
+        lv.InputError, match=r"J is a UnreadableArray on device cuda:0 that cannot be read"
+    ):
         lv.Batch(UnreadableArray(ARRAYS["J"]), ARRAYS["M"], ARRAYS["v_free"], cones=CONES)
     differentiable = HostArray(ARRAYS["M"])
     differentiable.requires_grad = True
@@ -119,7 +122,8 @@ def test_solve_with_tensors_of_pytorch_gives_the_same_answers():
     np.testing.assert_array_equal(solve(torch.from_numpy).impulse, solve(np.asarray).impulse)
     with pytest.raises(lv.InputError, match="requires a gradient"):
         lv.residual_many(
-            lv.Batch(*ARRAYS.values(), cones=CONES), torch.zeros((3, 2), dtype=torch.float64, requires_grad=True)
+            lv.Batch(*ARRAYS.values(), cones=CONES),
+            torch.zeros((3, 2), dtype=torch.float64, requires_grad=True),
         )
 
 
@@ -151,22 +155,34 @@ def check_results(like, to_numpy, rtol=0.0):
     batch = lv.Batch(*ARRAYS.values(), cones=CONES)
     impulse = np.full((3, 2), 0.25)
     for expected, results, names in (
-        (lv.solve_many(batch, tol=1e-9), lv.solve_many(batch, tol=1e-9, like=like), SOLUTION_ARRAYS),
-        (lv.residual_many(batch, impulse), lv.residual_many(batch, impulse, like=like), (*RESIDUAL_ARRAYS, "excess")),
+        (
+            lv.solve_many(batch, tol=1e-9),
+            lv.solve_many(batch, tol=1e-9, like=like),
+            SOLUTION_ARRAYS,
+        ),
+        (
+            lv.residual_many(batch, impulse),
+            lv.residual_many(batch, impulse, like=like),
+            (*RESIDUAL_ARRAYS, "excess"),
+        ),
     ):
         for name in names:
             array, own = getattr(results, name), getattr(expected, name)
             assert type(array) is type(like), name
             np.testing.assert_allclose(to_numpy(array), own, rtol=rtol, err_msg=name)
         assert results[1].__class__ is expected[1].__class__
-        np.testing.assert_array_equal(pickle.loads(pickle.dumps(results)).relative, expected.relative)
+        np.testing.assert_array_equal(
+            pickle.loads(pickle.dumps(results)).relative, expected.relative
+        )
     return lv.solve_many(batch, tol=1e-9, like=like)
 
 
 def test_solve_returns_arrays_of_the_library_of_its_arguments():
     many = check_results(StandardArray(np.zeros(1)), lambda x: x.array)
     assert "3 to 1e-09" in repr(many)
-    assert isinstance(lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray)
+    assert isinstance(
+        lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=np.zeros(1)).impulse, np.ndarray
+    )
 
 
 def test_impulses_of_from_efc_return_in_the_callers_library():
@@ -195,7 +211,9 @@ def test_results_return_as_tensors_of_pytorch(dtype):
     many.impulse[0, 0] = 7.0  # a copy
     assert many.impulse[0, 0] != 7.0
     with pytest.raises(lv.InputError, match="device meta"):
-        _ = lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=torch.zeros(1, device="meta")).impulse
+        _ = lv.solve_many(
+            lv.Batch(*ARRAYS.values(), cones=CONES), like=torch.zeros(1, device="meta")
+        ).impulse
     with pytest.raises(lv.InputError, match="J is a Tensor on device meta that cannot be read"):
         solve(lambda x: torch.zeros(x.shape, device="meta", dtype=torch.float64))
 
@@ -205,7 +223,9 @@ def test_results_return_as_arrays_of_jax():
     like = jax.numpy.zeros(1)
     check_results(like, np.asarray, 1e-6)
     with pytest.raises(lv.InputError, match="abstract array"):
-        jax.jit(lambda x: lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=x).impulse)(like)
+        jax.jit(lambda x: lv.solve_many(lv.Batch(*ARRAYS.values(), cones=CONES), like=x).impulse)(
+            like
+        )
 
 
 def test_results_return_as_arrays_of_warp():

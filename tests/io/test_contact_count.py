@@ -7,7 +7,9 @@ import lavender as lv
 from lavender.io.contact_count import count_contacts
 from lavender.io.efc import from_mujoco_many
 
-mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
+mujoco = pytest.importorskip(
+    "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+)
 
 # Boxes with each number of friction components on a plane, and a hinge with a limit and friction loss.
 SCENE = """<mujoco><option cone="{cone}"/><worldbody><geom type="plane" size="5 5 1"/>

@@ -70,7 +70,9 @@ def iterate_steps(model):
             mj.mj_copyData(copied, model, data)
         mj.mj_forward(model, forward)
         mj.mj_step(model, after)
-        if np.abs(forward.qacc).max() > 1e10:  # Two iterations of CG diverge on a weld: MuJoCo restarts.
+        if (
+            np.abs(forward.qacc).max() > 1e10
+        ):  # Two iterations of CG diverge on a weld: MuJoCo restarts.
             return
         yield data, forward, after
         data = after
@@ -88,7 +90,9 @@ every_model = [
 ]
 
 
-def test_engine_answer_of_unconverged_solve_predicts_the_next_velocity(integrator, cone, solver, feature):
+def test_engine_answer_of_unconverged_solve_predicts_the_next_velocity(
+    integrator, cone, solver, feature
+):
     model = make_model(integrator, cone, solver, feature, iterations=2)
     for _, forward, after in iterate_steps(model):
         for data in (forward, after):
@@ -104,8 +108,12 @@ def test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exa
     if INTEGRATORS[integrator][3] == "forces":
         pytest.skip("forces are judged by their own residual")
     if (integrator, solver, feature) == ("discrete", "PGS", "tendon"):
-        pytest.skip("with PGS, the matrix of discrete has no tendons, so that Newton solves another problem")
-    model, exact = (make_model(integrator, cone, name, feature, n) for name, n in ((solver, 2), ("Newton", 300)))
+        pytest.skip(
+            "with PGS, the matrix of discrete has no tendons, so that Newton solves another problem"
+        )
+    model, exact = (
+        make_model(integrator, cone, name, feature, n) for name, n in ((solver, 2), ("Newton", 300))
+    )
     exact.opt.ls_iterations, exact.opt.ls_tolerance = 300, 1e-10
     n_judged = 0
     for before, forward, after in iterate_steps(model):
@@ -134,10 +142,16 @@ def test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exa
 def test_acceleration_of_an_island_is_compared_with_this_island_alone():
     """The second of two blocks, which land at 100 and 1 m/s, keeps half of its speed."""
     problem = lv.Problem.from_jacobian(
-        np.eye(2), np.eye(2), [-100.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf), compliance=0.1
+        np.eye(2),
+        np.eye(2),
+        [-100.0, -1.0],
+        cones=lv.Cones.bounded([0.0, 0.0], np.inf),
+        compliance=0.1,
     )
     impulse = np.array([100.0, 0.5]) / 1.1
-    problem.__dict__["engine_motion"] = EngineMotion(impulse, impulse, problem.compliance, "acceleration")
+    problem.__dict__["engine_motion"] = EngineMotion(
+        impulse, impulse, problem.compliance, "acceleration"
+    )
     found = lv.residual(problem, impulse)
     assert found.moved_by == "acceleration"
     np.testing.assert_allclose((found.velocity, found.relative), 0.5 / 1.1, rtol=1e-9)
@@ -145,7 +159,9 @@ def test_acceleration_of_an_island_is_compared_with_this_island_alone():
 
 @pytest.mark.parametrize("options", [{"max_iter": 50}, {"history": True}])
 def test_solve_from_an_engines_forces_judges_forces_also_if_its_acceleration_is_exact(options):
-    problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [-3.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf))
+    problem = lv.Problem.from_jacobian(
+        np.eye(2), np.eye(2), [-3.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf)
+    )
     exact = np.array([3.0, 1.0])
     problem.__dict__["engine_motion"] = EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")
     assert lv.residual(problem, 0.5 * exact).relative < 1e-12
@@ -171,13 +187,17 @@ def test_from_mujoco_many_judges_and_predicts_as_single_steps(integrator, solver
     for before, forward, stepped in iterate_steps(model):
         states.append(get_state(model, before))
         after.append(stepped.qvel.copy())
-        single.append(lv.residual(lv.io.from_mujoco(model, forward), adapter.impulse(model, forward)))
+        single.append(
+            lv.residual(lv.io.from_mujoco(model, forward), adapter.impulse(model, forward))
+        )
     velocity = np.empty((len(states), model.nv))
     imported = lv.io.from_mujoco_many(model, np.array(states), velocity=velocity)
     np.testing.assert_allclose(velocity, after, rtol=1e-9, atol=1e-12)
     many = lv.residual_many(imported.batch, imported.impulse)
     # The blocks of an equality differ, and sums have another order.
-    np.testing.assert_allclose(many.velocity_error, [x.velocity for x in single], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        many.velocity_error, [x.velocity for x in single], rtol=1e-6, atol=1e-12
+    )
     for i, error in enumerate(many.velocity_error):
         assert many[i].velocity == error
 
@@ -210,7 +230,9 @@ def test_recorder_warns_of_a_step_that_its_answer_does_not_predict(integrator, t
 
         def record():
             mj.mj_step(model, data)
-            return recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))[0].prediction_gap
+            return recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))[
+                0
+            ].prediction_gap
 
         assert [record() for _ in range(3)] == [0.0, 0.0, 0.0]
         problem = lv.io.from_mujoco(model, data)
@@ -242,4 +264,6 @@ def test_rotation_rows_of_a_weld_are_the_angular_velocity_for_every_torque_scale
     problem = lv.io.from_mujoco(model, data)
     jac = problem.generalized.jac.toarray()
     np.testing.assert_allclose(np.abs(jac[:, 9:12]), np.eye(6)[:, 3:], atol=1e-12)
-    assert [problem.row_unit(k) for k in range(6)] == 3 * [problem.row_unit(0)] + 3 * [problem.row_unit(3)]
+    assert [problem.row_unit(k) for k in range(6)] == 3 * [problem.row_unit(0)] + 3 * [
+        problem.row_unit(3)
+    ]

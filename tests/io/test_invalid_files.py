@@ -20,7 +20,8 @@ h5py = pytest.importorskip("h5py")
 def matrix(name, m, n, nz, p, i, x):
     parts = {"m": [m], "n": [n], "nz": [nz], "nzmax": [max(nz, 0)], "p": p, "i": i, "x": x}
     return {
-        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v for key, v in parts.items()
+        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v
+        for key, v in parts.items()
     }
 
 
@@ -35,7 +36,9 @@ def test_load_of_fclib_with_a_mass_factor_beyond_memory_raises(monkeypatch):
     rng = np.random.default_rng(2)
     h = np.zeros((n, 3))
     h[:3] = np.eye(3)
-    chain = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1])
+    chain = sp.diags_array(
+        [np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1]
+    )
     shuffled = rng.permutation(n)
     chain = sp.csr_array(chain)[shuffled][:, shuffled]
     monkeypatch.setattr(fclib, "MAX_MASS_FACTOR_ENTRIES", n * n)
@@ -64,13 +67,26 @@ def valid_files(folder):
                 io.save(problem, path, impulse=np.zeros(problem.m))
                 files.append((suffix, path.read_bytes()))
     three = {"b": np.ones(3), "lo": np.zeros(3), "hi": np.ones(3)}
-    sparse = {"A_data": np.ones(3), "A_indices": np.arange(3), "A_indptr": np.arange(4), "A_shape": np.array([3, 3])}
+    sparse = {
+        "A_data": np.ones(3),
+        "A_indices": np.arange(3),
+        "A_indptr": np.arange(4),
+        "A_shape": np.array([3, 3]),
+    }
     cones = {"cone_start": np.array([0]), "cone_dim": np.array([3]), "cone_mu": np.array([0.5])}
     plain = {"A": np.eye(3), "l_ref": np.ones(3), "w_ref": np.zeros(3), "compare": "l,w"}
     mass = sp.csr_array(np.eye(6))
     h = sp.csr_array(np.ones((6, 3)))
-    vectors = {"spacedim": np.array([3], np.int32), "vectors/f": np.ones(6), "vectors/w": np.zeros(3)}
-    whole = matrix("M", 6, 6, -2, mass.indptr, mass.indices, mass.data) | vectors | {"vectors/mu": np.array([0.5])}
+    vectors = {
+        "spacedim": np.array([3], np.int32),
+        "vectors/f": np.ones(6),
+        "vectors/w": np.zeros(3),
+    }
+    whole = (
+        matrix("M", 6, 6, -2, mass.indptr, mass.indices, mass.data)
+        | vectors
+        | {"vectors/mu": np.array([0.5])}
+    )
     whole |= matrix("H", 6, 3, -2, h.indptr, h.indices, h.data)
     return [
         *files,
@@ -87,7 +103,9 @@ def arrays_in(suffix, data):
             return {name: archive[name] for name in archive.files}
     with h5py.File(streams.BytesIO(data)) as file:
         names = []
-        file.visititems(lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None)
+        file.visititems(
+            lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None
+        )
         return {name: file[name][()] for name in names}
 
 
@@ -137,7 +155,9 @@ def list_replacements(x):
     }.items()
     if x.dtype.kind in "iuf":
         yield from {"text": np.full(x.shape, "a"), "complex": x.astype(complex)}.items()
-        above = int(np.max(x, initial=0)) + 1 if x.dtype.kind in "iu" else 0  # the first number out of range
+        above = (
+            int(np.max(x, initial=0)) + 1 if x.dtype.kind in "iu" else 0
+        )  # the first number out of range
         for value in (-1, above, 2**31 - 1) if above else (np.nan, np.inf, -1.0):
             with np.errstate(all="ignore"):
                 y = x.astype(x.dtype)
@@ -149,7 +169,9 @@ def list_replacements(x):
 
 def read_replaced(path, suffix, arrays, name, x):
     """Read a file in which one array is replaced; return the error's message, or an empty string."""
-    path.write_bytes(file_of(suffix, {k: v for k, v in (arrays | {name: x}).items() if v is not None}))
+    path.write_bytes(
+        file_of(suffix, {k: v for k, v in (arrays | {name: x}).items() if v is not None})
+    )
     try:
         io.read(path)
     except lv.LavenderError as error:
@@ -170,8 +192,14 @@ def test_file_with_an_array_replaced_names_it_or_is_read_as_approved(tmp_path):
         accepted[kind] = []
         for name, x in arrays.items():
             last = name.rpartition("/")[2]
-            words = [re.escape(w) for w in (last, last.replace("_", "."), last.partition("_")[2]) if w]
-            words += [WORDS[key] for key in (last, last.rpartition("_")[2], last.partition("_")[2]) if key in WORDS]
+            words = [
+                re.escape(w) for w in (last, last.replace("_", "."), last.partition("_")[2]) if w
+            ]
+            words += [
+                WORDS[key]
+                for key in (last, last.rpartition("_")[2], last.partition("_")[2])
+                if key in WORDS
+            ]
             pattern = re.compile(rf"{re.escape(str(path))}.*\b(?:{'|'.join(words)})\b", re.DOTALL)
             read = []
             for how, value in list_replacements(np.array(x)):
@@ -179,7 +207,9 @@ def test_file_with_an_array_replaced_names_it_or_is_read_as_approved(tmp_path):
                     continue  # HDF5 has no texts of NumPy.
                 message = read_replaced(path, suffix, arrays, name, value)
                 read += [how] * (not message)
-                unnamed += [f"{name}, {how}: {message}"] * bool(message and not pattern.search(message))
+                unnamed += [f"{name}, {how}: {message}"] * bool(
+                    message and not pattern.search(message)
+                )
             accepted[kind] += [f"{name}: {', '.join(read) or 'none'}"]
     assert not unnamed, "\n".join(unnamed)
     for kind, names in accepted.items():

@@ -10,7 +10,11 @@ pytest.importorskip("pydrake", reason="needs Drake: pip install 'lavender-contac
 
 from pydrake.geometry import HalfSpace, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, DiscreteContactApproximation
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    DiscreteContactApproximation,
+)
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -29,17 +33,25 @@ def robot(approximation=DiscreteContactApproximation.kSap, damping=0.3, sampled=
     plant.set_discrete_contact_approximation(approximation)
     plant.SetUseSampledOutputPorts(sampled)
     friction = CoulombFriction(0.5, 0.5)
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction
+    )
     box = plant.AddRigidBody("box", inertia(1.0, (0.2, 0.2, 0.2)))
     for k, corner in enumerate(np.array([[x, y, -0.1] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])):
         plant.RegisterCollisionGeometry(
             box, RigidTransform(corner), Sphere(0.01), f"corner {k}", CoulombFriction(0.4, 0.3)
         )
     cart = plant.AddRigidBody("cart", inertia(0.7, (0.1, 0.1, 0.1)))
-    rail = plant.AddFrame(FixedOffsetFrame("rail", plant.world_frame(), RigidTransform([0.0, 0.0, 0.0597])))
-    slide = plant.AddJoint(PrismaticJoint("slide", rail, cart.body_frame(), [1, 0, 0], -0.5, 0.25, damping))
+    rail = plant.AddFrame(
+        FixedOffsetFrame("rail", plant.world_frame(), RigidTransform([0.0, 0.0, 0.0597]))
+    )
+    slide = plant.AddJoint(
+        PrismaticJoint("slide", rail, cart.body_frame(), [1, 0, 0], -0.5, 0.25, damping)
+    )
     arm = plant.AddRigidBody("arm", SpatialInertia.SolidBoxWithMass(0.3, 0.4, 0.05, 0.05))
-    hinge = plant.AddJoint(RevoluteJoint("hinge", cart.body_frame(), arm.body_frame(), [0, 1, 0], -2.0, 2.0, damping))
+    hinge = plant.AddJoint(
+        RevoluteJoint("hinge", cart.body_frame(), arm.body_frame(), [0, 1, 0], -2.0, 2.0, damping)
+    )
     plant.RegisterCollisionGeometry(arm, RigidTransform([0.4, 0, 0]), Sphere(0.02), "tip", friction)
     plant.Finalize()
     diagram = builder.Build()
@@ -56,7 +68,9 @@ def robot(approximation=DiscreteContactApproximation.kSap, damping=0.3, sampled=
 
 
 def next_velocity(plant, context):
-    return np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[-plant.num_velocities() :]
+    return np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())[
+        -plant.num_velocities() :
+    ]
 
 
 APPROXIMATIONS = [DiscreteContactApproximation.kSap, DiscreteContactApproximation.kLagged]
@@ -84,12 +98,16 @@ def test_from_drake_of_states_at_the_tolerance_of_sap_is_accepted(ratio, count, 
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=DT)
     plant.SetUseSampledOutputPorts(False)
     friction = CoulombFriction(0.5, 0.5)
-    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+    plant.RegisterCollisionGeometry(
+        plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction
+    )
     balls = []
     for i in range(count):
         solid = SpatialInertia.SolidSphereWithMass(ratio ** (i / (count - 1)), 0.1)
         balls.append(plant.AddRigidBody(f"ball {i}", solid))
-        plant.RegisterCollisionGeometry(balls[i], RigidTransform(), Sphere(0.1), f"sphere {i}", friction)
+        plant.RegisterCollisionGeometry(
+            balls[i], RigidTransform(), Sphere(0.1), f"sphere {i}", friction
+        )
     plant.Finalize()
     diagram = builder.Build()
     whole = diagram.CreateDefaultContext()
@@ -103,7 +121,9 @@ def test_from_drake_of_states_at_the_tolerance_of_sap_is_accepted(ratio, count, 
         after = next_velocity(plant, context)
         own = problem.velocity(drake.impulse(plant, context))
         assert np.abs(own - after).max() < 1e-5 * (1.0 + np.abs(after).max())
-        context.SetDiscreteState(0, np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value()))
+        context.SetDiscreteState(
+            0, np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
+        )
 
 
 def test_from_drake_rows_are_relative_velocities_of_the_surfaces():
@@ -119,7 +139,9 @@ def test_from_drake_rows_are_relative_velocities_of_the_surfaces():
         point = results.point_pair_contact_info(i).contact_point()
         moved = spatial.translational() + np.cross(spatial.rotational(), point - place)
         np.testing.assert_allclose(rows[3 * i], moved[2], atol=1e-12)  # the ground's normal is up
-        np.testing.assert_allclose(np.hypot(*rows[3 * i + 1 : 3 * i + 3]), np.hypot(*moved[:2]), atol=1e-12)
+        np.testing.assert_allclose(
+            np.hypot(*rows[3 * i + 1 : 3 * i + 3]), np.hypot(*moved[:2]), atol=1e-12
+        )
     np.testing.assert_allclose(problem.cones.mu[:5], [2 * 0.3 * 0.5 / 0.8] * 4 + [0.5])
 
 
@@ -130,7 +152,9 @@ def test_from_drake_v_free_is_the_step_without_contacts_and_limits():
     plant.GetJointByName("hinge").set_angle(context, -0.5)  # up
     problem = lv.io.from_drake(plant, context)
     assert problem.m == 4  # limits, far away
-    np.testing.assert_allclose(problem.generalized.v_free, next_velocity(plant, context), atol=1e-12)
+    np.testing.assert_allclose(
+        problem.generalized.v_free, next_velocity(plant, context), atol=1e-12
+    )
     assert not drake.impulse(plant, context).any()
     assert lv.solve(problem).success
 
@@ -148,7 +172,9 @@ def test_from_drake_rigid_answer_is_near_that_of_sap(approximation):
         assert found.success
         after = next_velocity(plant, context)
         action = np.abs(problem.generalized.v_free - after).max()
-        gaps.append(np.abs(problem.velocity(found.impulse) - after).max() / action if action > 0.0 else 0.0)
+        gaps.append(
+            np.abs(problem.velocity(found.impulse) - after).max() / action if action > 0.0 else 0.0
+        )
     assert np.median(gaps) < 0.1  # 0.6 % where it was written; 1 would be no relation at all
 
 

@@ -32,7 +32,9 @@ def forwarded(model, state):
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-@pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)])
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)]
+)
 def test_from_mujoco_many_of_a_state_equals_from_mujoco(cone, condim, jacobian):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim, jacobian=jacobian))
     states = states_of(model, 6)
@@ -44,19 +46,29 @@ def test_from_mujoco_many_of_a_state_equals_from_mujoco(cone, condim, jacobian):
         own = batch[i]
         # Of an equality each row has a name of its own here, and a normal alone needs no word for it.
         held = int(np.count_nonzero(data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY))
-        words = [[p.row_name(k).removesuffix(", normal") for k in range(p.m)] for p in (problem, own)]
-        assert words[0][held:] == words[1][held:] and all("equality" in word for word in words[1][:held])
+        words = [
+            [p.row_name(k).removesuffix(", normal") for k in range(p.m)] for p in (problem, own)
+        ]
+        assert words[0][held:] == words[1][held:] and all(
+            "equality" in word for word in words[1][:held]
+        )
         # Rows of an equality are blocks of their own here, and a normal alone is a row: the same bounds.
         for name in ("lower", "upper", "friction_rows"):
             assert getattr(own.cones, name).tolist() == getattr(problem.cones, name).tolist(), name
-        assert own.cones.mu[own.cones.mu > 0.0].tolist() == problem.cones.mu[problem.cones.mu > 0.0].tolist()
+        assert (
+            own.cones.mu[own.cones.mu > 0.0].tolist()
+            == problem.cones.mu[problem.cones.mu > 0.0].tolist()
+        )
         # Sums of a few terms in another order.
         size = abs(problem.generalized.jac).max()
         assert abs(own.generalized.jac - problem.generalized.jac).max() <= 1e-13 * size
         np.testing.assert_allclose(own.b, problem.b, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(own.compliance, problem.compliance, rtol=1e-12)
         np.testing.assert_allclose(
-            own.generalized.mass.toarray(), problem.generalized.mass.toarray(), rtol=1e-12, atol=1e-15
+            own.generalized.mass.toarray(),
+            problem.generalized.mass.toarray(),
+            rtol=1e-12,
+            atol=1e-15,
         )
         one = lv.residual(problem, single.impulse(model, data))
         assert found.velocity_error[i] == pytest.approx(one.velocity, rel=1e-3, abs=1e-9)
@@ -76,7 +88,9 @@ def test_from_mujoco_many_with_scratch_has_the_bits_of_calls_without_it():
         expected = lv.io.from_mujoco_many(model, some, errors="status")
         batch, impulse = lv.io.from_mujoco_many(model, some, errors="status", scratch=scratch)
         assert impulse.tobytes() == expected.impulse.tobytes()
-        assert all(batch[i] == expected.batch[i] for i in range(len(some)) if np.isfinite(some[i]).all())
+        assert all(
+            batch[i] == expected.batch[i] for i in range(len(some)) if np.isfinite(some[i]).all()
+        )
     assert scratch.take_data() is kept  # Every call used the same MjData.
 
 
@@ -134,7 +148,9 @@ def test_from_mujoco_many_keeps_rows_of_zeros(jacobian):
     data = forwarded(model, np.zeros(2))
     batch, impulse = lv.io.from_mujoco_many(model, np.zeros((3, 2)))
     for i in range(3):
-        np.testing.assert_array_equal(impulse.reshape(3, -1)[i], model.opt.timestep * data.efc_force)
+        np.testing.assert_array_equal(
+            impulse.reshape(3, -1)[i], model.opt.timestep * data.efc_force
+        )
         assert batch[i].row_name(0) == "friction of joint 0"
 
 
@@ -159,7 +175,10 @@ def test_from_mujoco_many_of_moving_surfaces_has_their_speed(cone):
         assert problem.m > 0
         np.testing.assert_allclose(batch[i].b, problem.b, rtol=1e-9, atol=1e-12)
         # MuJoCo's Newton to its end, where its own impulses are an answer to rounding.
-        assert max(found.velocity_error[i], lv.residual(problem, single.impulse(model, data)).velocity) < 1e-9
+        assert (
+            max(found.velocity_error[i], lv.residual(problem, single.impulse(model, data)).velocity)
+            < 1e-9
+        )
         after = problem.velocity(lv.solve(problem, tol=1e-12).impulse)
         np.testing.assert_allclose(after, data.qvel + dt * data.qacc, atol=1e-9, rtol=0)
 
@@ -172,7 +191,10 @@ def stacked(model, states, dtype):
     nv = model.nv
     jac = np.zeros((n, m, nv), dtype)
     of = np.zeros((n, m), int)
-    rows = {name: np.ones((n, m), dtype) for name in ("efc_D", "efc_aref", "efc_frictionloss", "efc_force")}
+    rows = {
+        name: np.ones((n, m), dtype)
+        for name in ("efc_D", "efc_aref", "efc_frictionloss", "efc_force")
+    }
     mass = np.zeros((n, nv, nv))
     contacts = [[], [], [], []]
     for i, d in enumerate(datas):
@@ -205,7 +227,9 @@ def stacked(model, states, dtype):
 def test_from_efc_in_float32_is_judged_by_its_own_floor(cone, condim):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim))
     states = states_of(model, 12)
-    exact, rough = (lv.io.from_efc(**stacked(model, states, dtype)) for dtype in (np.float64, np.float32))
+    exact, rough = (
+        lv.io.from_efc(**stacked(model, states, dtype)) for dtype in (np.float64, np.float32)
+    )
     assert (exact.batch.precision, rough.batch.precision) == ("float64", "float32")
     ragged = lv.io.from_mujoco_many(model, states)
     ragged.batch.engine_motions.clear()  # Without qacc, `from_efc` judges forces.
@@ -244,7 +268,9 @@ def test_from_efc_does_not_read_rows_above_nefc(junk):
             given[name][i, m:] = junk
     batch, impulse = lv.io.from_efc(**given)
     for i, m in enumerate(given["nefc"]):
-        np.testing.assert_array_equal(impulse[i], np.r_[clean.impulse[i, :m], np.zeros(len(impulse[i]) - m)])
+        np.testing.assert_array_equal(
+            impulse[i], np.r_[clean.impulse[i, :m], np.zeros(len(impulse[i]) - m)]
+        )
     many = lv.solve_many(batch, impulse=impulse)
     same = lv.solve_many(clean.batch, impulse=clean.impulse)
     np.testing.assert_array_equal(many.impulse, same.impulse)
@@ -272,7 +298,9 @@ def test_from_efc_of_a_world_with_a_bad_acceleration_has_no_answer(bad):
     arrays["qacc"][1, 0] = bad
     found = lv.io.from_efc(**arrays)
     assert np.isnan(found.impulse[1]).all()
-    np.testing.assert_array_equal(np.delete(found.impulse, 1, axis=0), np.delete(fine.impulse, 1, axis=0))
+    np.testing.assert_array_equal(
+        np.delete(found.impulse, 1, axis=0), np.delete(fine.impulse, 1, axis=0)
+    )
     judged = lv.residual_many(found.batch, found.impulse).velocity_error
     assert np.isfinite(judged).tolist() == [True, False, True]
 

@@ -23,7 +23,9 @@ def local_problem(spacedim=3, contacts=4, guess=True):
     w = sp.csr_array(rng.normal(size=(m, m)) * (rng.random((m, m)) < 0.6))
     w.data[0] = 0.0
     rolling = rng.uniform(0.0, 0.3, contacts) if spacedim == 5 else None
-    cones = lv.Cones.contacts(rng.uniform(0.0, 1.0, contacts), min(spacedim - 1, 2), rolling=rolling)
+    cones = lv.Cones.contacts(
+        rng.uniform(0.0, 1.0, contacts), min(spacedim - 1, 2), rolling=rolling
+    )
     guess = rng.random(m) if guess else None
     return lv.Problem(rng.normal(size=m), cones, w, guess=guess, name="local")
 
@@ -34,7 +36,9 @@ def global_problem(seed=0, tangents=2, **more):
 
 def soft(problem, compliance=0.0):
     """The same with one compliance for every row."""
-    return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=np.full(problem.m, compliance))
+    return lv.Problem(
+        problem.b, problem.cones, rows=problem.rows, compliance=np.full(problem.m, compliance)
+    )
 
 
 @pytest.mark.parametrize("spacedim", [2, 3, 5])
@@ -54,7 +58,9 @@ def test_fclib_local_file_keeps_every_bit(tmp_path, spacedim, suffix):
     assert stored.info["title"] == "local"
     with h5py.File(path) as file:  # FCLIB's own names, in FCLIB's sign
         group = file[kind]
-        w = sp.csr_array((group["W/x"][()], group["W/i"][()], group["W/p"][()]), shape=(problem.m, problem.m))
+        w = sp.csr_array(
+            (group["W/x"][()], group["W/i"][()], group["W/p"][()]), shape=(problem.m, problem.m)
+        )
         assert np.array_equal(w.toarray(), problem.dense())
         assert np.array_equal(group["vectors/q"][()], -problem.b)
         assert np.array_equal(group["vectors/mu"][()], problem.cones.mu)
@@ -81,7 +87,9 @@ def test_save_of_bodies_writes_the_local_form_with_the_bits_of_a(tmp_path_factor
     stored = lavender.io.read(path)
     assert stored.format == ("fclib_local_rolling" if spacedim == 5 else "fclib_local")
     assert stored.problem.cones == problem.cones and stored.impulse.tobytes() == impulse.tobytes()
-    assert np.array_equal(stored.problem.dense(), problem.dense())  # compliance is on the diagonal of W
+    assert np.array_equal(
+        stored.problem.dense(), problem.dense()
+    )  # compliance is on the diagonal of W
     assert np.array_equal(stored.problem.b, problem.b)
 
 
@@ -129,22 +137,32 @@ W = np.array([[2.0, 0.5, 0.0], [0.0, 1.0, 0.25], [0.125, 0.0, 3.0]])
 @pytest.mark.parametrize("spare", [0, 5])
 @pytest.mark.parametrize("nz", [-2, -1, 0])
 def test_load_of_fclib_in_every_matrix_storage_gives_the_same_problem(tmp_path, nz, spare):
-    problem = lavender.io.load(make(tmp_path / "p.h5", W=encoded(W, nz, spare), q=np.arange(3.0), mu=[0.5]))
+    problem = lavender.io.load(
+        make(tmp_path / "p.h5", W=encoded(W, nz, spare), q=np.arange(3.0), mu=[0.5])
+    )
     assert np.array_equal(problem.dense(), W)
     assert np.array_equal(problem.b, -np.arange(3.0))
     m = np.diag([2.0, 4.0, 0.5, 1.0])
     h = np.vstack([W, np.ones(3)])
     parts = {"M": encoded(m, nz, spare), "H": encoded(h, nz, spare)}
-    problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(4.0), w=np.ones(3), mu=[0.5], **parts))
+    problem = lavender.io.load(
+        make(tmp_path / "g.h5", f=np.arange(4.0), w=np.ones(3), mu=[0.5], **parts)
+    )
     assert np.array_equal(problem.generalized.jac.toarray(), h.T)
     assert np.array_equal(problem.generalized.mass.toarray(), m)
     np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-15)
-    assert np.array_equal(problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0)))  # powers of two: exact
+    assert np.array_equal(
+        problem.b, -(np.ones(3) + h.T @ np.linalg.inv(m) @ np.arange(4.0))
+    )  # powers of two: exact
 
 
 def test_load_of_fclib_sums_repeated_triplets(tmp_path):
     parts = {n: np.array([v], np.int32) for n, v in {"m": 3, "n": 3, "nz": 4, "nzmax": 4}.items()}
-    parts |= {"p": np.array([0, 1, 2, 1]), "i": np.array([0, 1, 2, 1]), "x": np.array([1.0, 2.0, 3.0, 4.0])}
+    parts |= {
+        "p": np.array([0, 1, 2, 1]),
+        "i": np.array([0, 1, 2, 1]),
+        "x": np.array([1.0, 2.0, 3.0, 4.0]),
+    }
     problem = lavender.io.load(make(tmp_path / "p.h5", W=parts, q=np.zeros(3), mu=[0.0]))
     assert np.array_equal(problem.dense(), np.diag([1.0, 6.0, 3.0]))
 
@@ -154,7 +172,9 @@ def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
     h = W.T
     m[0, 1] = 1.0
     parts = {"M": encoded(m, -2), "H": encoded(h, -2)}
-    problem = lavender.io.load(make(tmp_path / "g.h5", f=np.arange(3.0), w=np.ones(3), mu=[0.5], **parts))
+    problem = lavender.io.load(
+        make(tmp_path / "g.h5", f=np.arange(3.0), w=np.ones(3), mu=[0.5], **parts)
+    )
     assert problem.operator == "matrix"
     np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-14, atol=1e-15)
 
@@ -168,12 +188,23 @@ def test_load_of_fclib_equations_become_free_rows(tmp_path):
     w = np.ones(3)
     b = np.array([0.25])
     glob = lavender.io.load(
-        make(tmp_path / "g.h5", M=encoded(m, -2), H=encoded(h, -2), G=encoded(g, -2), f=f, w=w, b=b, mu=[0.5])
+        make(
+            tmp_path / "g.h5",
+            M=encoded(m, -2),
+            H=encoded(h, -2),
+            G=encoded(g, -2),
+            f=f,
+            w=w,
+            b=b,
+            mu=[0.5],
+        )
     )
     inv = np.linalg.inv(m)
     local = {"W": h.T @ inv @ h, "V": h.T @ inv @ g, "R": g.T @ inv @ g}
     parts = {name: encoded(x, -2) for name, x in local.items()}
-    loc = lavender.io.load(make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts))
+    loc = lavender.io.load(
+        make(tmp_path / "l.h5", q=w + h.T @ inv @ f, s=b + g.T @ inv @ f, mu=[0.5], **parts)
+    )
     assert glob.cones.kind.tolist() == [lv.CONTACT, lv.ROW]
     np.testing.assert_allclose(glob.dense(), loc.dense(), rtol=1e-15, atol=1e-15)
     assert np.array_equal(glob.b, loc.b)
@@ -183,7 +214,10 @@ def test_load_of_fclib_equations_become_free_rows(tmp_path):
         for name, x in (("r", [1.0, 0.2, 0.3]), ("u", [0.0, 0.5, 0.0]), ("l", [7.0])):
             file[f"solution/{name}"] = x
     stored = lavender.io.read(tmp_path / "l.h5")  # On an equation the slack is 0.
-    assert (stored.impulse.tolist(), stored.slack.tolist()) == ([1.0, 0.2, 0.3, 7.0], [0.0, 0.5, 0.0, 0.0])
+    assert (stored.impulse.tolist(), stored.slack.tolist()) == (
+        [1.0, 0.2, 0.3, 7.0],
+        [0.0, 0.5, 0.0, 0.0],
+    )
 
 
 def test_load_of_fclib_with_both_forms_reads_the_local_one(tmp_path):
@@ -198,14 +232,27 @@ def test_save_to_fclib_of_unsupported_data_names_it(tmp_path):
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
     single = np.eye(3, dtype=np.float32)
     moved = lv.Problem.from_jacobian(
-        single, single, single[0], cones=lv.Cones.contacts(0.5), dof_names=["x", "y", "z"], name="\ud800"
+        single,
+        single,
+        single[0],
+        cones=lv.Cones.contacts(0.5),
+        dof_names=["x", "y", "z"],
+        name="\ud800",
     )
     heavy = lv.Problem.from_rows(touching([[-1, 0]], inv_mass=[0.0]), tangents=2)
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 bounded rows"]),
         (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 free rows"]),
-        (random_contact_problem(0), {}, ["blocks of bounded rows", "torsional friction", "contacts of"]),
-        (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["torsional friction"]),
+        (
+            random_contact_problem(0),
+            {},
+            ["blocks of bounded rows", "torsional friction", "contacts of"],
+        ),
+        (
+            lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]),
+            {},
+            ["torsional friction"],
+        ),
         (lv.Problem.contact(np.eye(2), np.ones(2), [0.0, 0.0]), {}, ["contacts of 1 rows"]),
         (lv.Problem.contact(np.eye(3), np.ones(3), [0.5], friction="cone"), {}, ["'cone' law"]),
         (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
@@ -239,8 +286,14 @@ GOOD = encoded(W, -2)
     [
         ({"W": GOOD | {"m": np.array([2**40])}}, "32-bit integer"),
         ({"W": GOOD | {"nz": np.array([-3], np.int32)}}, "nz must be -2"),
-        ({"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}}, "nz announces 5 triplets"),
-        ({"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}}, "outside of the matrix"),
+        (
+            {"W": GOOD | {"nz": np.array([5], np.int32), "p": np.zeros(4, np.int32)}},
+            "nz announces 5 triplets",
+        ),
+        (
+            {"W": GOOD | {"nz": np.array([3], np.int32), "p": np.array([0, 1, 3], np.int32)}},
+            "outside of the matrix",
+        ),
         ({"mu": [-0.5]}, "mu"),
         ({"spacedim": 2}, "has 3 rows; a multiple of spacedim = 2"),
         ({"spacedim": 5}, "2 or 3 is needed"),

@@ -44,7 +44,9 @@ def test_problem_has_the_engines_rows_and_law(model):
         matrix = jac @ np.linalg.solve(mass, jac.T) + np.diag(soft)
         b = dt * (array_of(scene, f"{state}aref")[:m, i] - jac @ smooth)
         if model != "convex":  # With torsion, rows are scaled by their coefficients.
-            np.testing.assert_allclose(problem.dense(), matrix, rtol=1e-6, atol=1e-6 * np.abs(matrix).max())
+            np.testing.assert_allclose(
+                problem.dense(), matrix, rtol=1e-6, atol=1e-6 * np.abs(matrix).max()
+            )
             np.testing.assert_allclose(problem.b, b, rtol=1e-5, atol=1e-6)
 
 
@@ -71,7 +73,9 @@ def test_from_genesis_takes_the_velocity_before_from_the_acceleration_of_the_int
     solver.rigid_config.integrator = getattr(names, integrator)
     solver.rigid_config.enable_mujoco_compatibility = is_compatible
     solver.dyn_info = SimpleNamespace(dofs=SimpleNamespace(damping=Recorded(np.zeros(3))))
-    acc, vel, smooth = (array_of(scene, f"dyn_state.dofs.{name}") for name in ("acc", "vel", "acc_smooth"))
+    acc, vel, smooth = (
+        array_of(scene, f"dyn_state.dofs.{name}") for name in ("acc", "vel", "acc_smooth")
+    )
     solver.dyn_state.dofs.acc = Recorded(0.5 * acc)
     step = lv.io.from_genesis(scene)
     dt = solver.substep_dt
@@ -95,12 +99,15 @@ class Box:
 
 
 @pytest.mark.parametrize(
-    ("plane", "box", "is_hidden"), [(None, 0.2, True), (0.3, 0.2, False), (None, 1.5, False), (None, None, False)]
+    ("plane", "box", "is_hidden"),
+    [(None, 0.2, True), (0.3, 0.2, False), (None, 1.5, False), (None, None, False)],
 )
 def test_from_genesis_with_friction_below_the_default_of_a_plane_warns(plane, box, is_hidden):
     scene = make_genesis("convex")
     pairs = ((Plane(), plane), (Box(), box))
-    scene.entities = [SimpleNamespace(morph=m, material=SimpleNamespace(friction=x)) for m, x in pairs]
+    scene.entities = [
+        SimpleNamespace(morph=m, material=SimpleNamespace(friction=x)) for m, x in pairs
+    ]
     if is_hidden:
         with pytest.warns(UserWarning, match=r"friction 0\.2, and a plane the default of 1"):
             lv.io.from_genesis(scene)

@@ -21,7 +21,9 @@ def engine_world(solver, i):
     sigma = float(solver._solver_kamino.solver_fd.data.state.sigma.numpy()[i][0])
     matrix = (matrix - sigma * np.eye(size)) / np.outer(scale, scale)
     b = -problem.v_f.numpy()[first : first + size] / scale
-    lam = solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[first : first + size].astype(float)
+    lam = solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[
+        first : first + size
+    ].astype(float)
     counts = [int(x.numpy()[i]) for x in (problem.njc, problem.nbc, problem.nl, problem.nc)]
     return matrix, b, lam, counts
 
@@ -43,7 +45,10 @@ def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
         problem = step.batch[i]
         order = normals_first(*counts)
         # float32 roundings of sums of up to 24 terms
-        assert np.abs(problem.dense() - matrix[np.ix_(order, order)]).max() <= 1e-6 * np.abs(matrix).max()
+        assert (
+            np.abs(problem.dense() - matrix[np.ix_(order, order)]).max()
+            <= 1e-6 * np.abs(matrix).max()
+        )
         assert np.abs(problem.b - b[order]).max() <= 1e-6 * (np.abs(b).max() + 1.0)
         np.testing.assert_array_equal(step.impulse[step.batch.rows_of(i)], lam[order])
         # joints are free, each in one block; then bounded rows, limits, and contacts of three rows
@@ -52,12 +57,16 @@ def test_from_kamino_problems_equal_the_matrix_of_the_engine(model):
         assert np.isinf(lower[:joints]).all() and np.isinf(upper[:joints]).all()
         acts = slice(joints, joints + bounded)
         assert (lower[acts] < 0.0).all() and np.isfinite(lower[acts]).all()
-        np.testing.assert_array_equal(lower[acts], -upper[acts])  # the limits of the recorded motor are symmetrical
+        np.testing.assert_array_equal(
+            lower[acts], -upper[acts]
+        )  # the limits of the recorded motor are symmetrical
         assert (lower[joints + bounded : joints + bounded + limits] == 0.0).all()
         assert problem.cones.is_contact.sum() == contacts
         assert (problem.cones.mu[problem.cones.is_contact] > 0.0).all()
         assert len(problem.names) == problem.cones.n_blocks
-        linear = problem.jacobian[:, np.arange(problem.generalized.nv) % 6 < 3]  # Velocities of bodies.
+        linear = problem.jacobian[
+            :, np.arange(problem.generalized.nv) % 6 < 3
+        ]  # Velocities of bodies.
         is_angular = [problem.row_unit(k) == "rad/s" for k in range(problem.m)]
         assert is_angular == [not x.any() for x in linear.toarray()]
 
@@ -95,10 +104,14 @@ def test_from_kamino_immovable_bodies_keep_their_velocity():
     solver = make_kamino("stacks", inv_m_i=fix, inv_I_i=fix)
     engine = solver._solver_kamino
     problem, jacobians = engine.problem_fd.data, engine._jacobians.data
-    for i, m in enumerate(problem.dim.numpy()):  # The engine's D, had it known that these bodies cannot move.
+    for i, m in enumerate(
+        problem.dim.numpy()
+    ):  # The engine's D, had it known that these bodies cannot move.
         m = int(m)
         nv = 12
-        jac = jacobians.J_cts_data.numpy()[jacobians.J_cts_offsets.numpy()[i] :][: m * nv].reshape(m, nv)
+        jac = jacobians.J_cts_data.numpy()[jacobians.J_cts_offsets.numpy()[i] :][: m * nv].reshape(
+            m, nv
+        )
         inv_mass = np.zeros((nv, nv))
         inv_mass[:3, :3] = np.eye(3) * engine._model.bodies.inv_m_i.numpy()[2 * i]
         inv_mass[3:6, 3:6] = engine.data.bodies.inv_I_i.numpy()[2 * i]
@@ -116,9 +129,16 @@ def test_from_kamino_immovable_bodies_keep_their_velocity():
 
 @pytest.mark.parametrize(
     "config",
-    [{}, {"sparse_jacobian": True}, {"dynamics_solver": "dvi"}, {"dynamics_solver": "dvi", "sparse_jacobian": False}],
+    [
+        {},
+        {"sparse_jacobian": True},
+        {"dynamics_solver": "dvi"},
+        {"dynamics_solver": "dvi", "sparse_jacobian": False},
+    ],
 )
-def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_compliance(config, monkeypatch):
+def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_compliance(
+    config, monkeypatch
+):
     pytest.importorskip("newton")
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "findings" / "probes")
     from record_kamino import step_worlds
@@ -128,5 +148,7 @@ def test_from_kamino_of_the_installed_engine_gives_the_matrix_of_j_m_and_complia
     solver, after = step_worlds([basics.build_boxes_hinged()] * 2, False, **config)
     step = lv.io.from_kamino(solver, verify=True)
     assert (lv.residual_many(step.batch, step.impulse).velocity_error < 1e-4).all()
-    velocity = np.concatenate([step.batch[i].velocity(step.impulse[step.batch.rows_of(i)]) for i in range(2)])
+    velocity = np.concatenate(
+        [step.batch[i].velocity(step.impulse[step.batch.rows_of(i)]) for i in range(2)]
+    )
     assert np.abs(velocity - after.ravel()).max() <= VELOCITY_TOLERANCE

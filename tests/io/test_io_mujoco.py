@@ -22,7 +22,14 @@ PGS = 1e-6  # its improvement of a whole sweep is small long before the distance
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 @pytest.mark.parametrize(
     ("cone", "condim"),
-    [("elliptic", 3), ("elliptic", 4), ("elliptic", 6), ("elliptic", 1), ("pyramidal", 3), ("pyramidal", 6)],
+    [
+        ("elliptic", 3),
+        ("elliptic", 4),
+        ("elliptic", 6),
+        ("elliptic", 1),
+        ("pyramidal", 3),
+        ("pyramidal", 6),
+    ],
 )
 def test_from_mujoco_answer_of_newton_is_a_solution(cone, condim, jacobian):
     model, data = state(cone, condim=condim, jacobian=jacobian)
@@ -44,7 +51,9 @@ def test_from_mujoco_matrix_and_b_equal_the_arrays_of_mujoco():
     a = jac @ np.linalg.solve(mass, jac.T) + np.diag(data.efc_R)
     # 1e-12: rounding of a dense solve with the condition number of M, about 1e3.
     np.testing.assert_allclose(problem.dense(), a, atol=1e-12 * np.abs(a).max())
-    np.testing.assert_allclose(problem.b, -model.opt.timestep * data.efc_b, atol=1e-14 * np.abs(data.efc_b).max())
+    np.testing.assert_allclose(
+        problem.b, -model.opt.timestep * data.efc_b, atol=1e-14 * np.abs(data.efc_b).max()
+    )
     assert problem.asymmetry == 0.0
 
 
@@ -56,7 +65,9 @@ def test_from_mujoco_blocks_have_names_and_kinds():
     assert list(c.ptr[:2]) == [0, 3] and np.isinf(c.upper[:3]).all()
     door = problem.names.index("friction of joint door")
     row = c.ptr[door]
-    assert (c.lower[row], c.upper[row]) == pytest.approx((-0.1 * model.opt.timestep, 0.1 * model.opt.timestep))
+    assert (c.lower[row], c.upper[row]) == pytest.approx(
+        (-0.1 * model.opt.timestep, 0.1 * model.opt.timestep)
+    )
     spin = np.flatnonzero(c.kind == lv.ROUND)
     assert len(spin)
     assert c.mu[spin] == pytest.approx(0.5)
@@ -70,7 +81,9 @@ def test_from_mujoco_blocks_have_names_and_kinds():
 def test_from_mujoco_with_unequal_coefficients_scales_rows_to_a_round_cone(condim):
     text = scene(condim=condim)
     pair = '<contact><pair geom1="low" geom2="high" condim="{}" friction="0.6 0.2 0.02 0.003 0.001"/></contact>'
-    model = mj.MjModel.from_xml_string(text.replace("<equality>", pair.format(condim) + "<equality>"))
+    model = mj.MjModel.from_xml_string(
+        text.replace("<equality>", pair.format(condim) + "<equality>")
+    )
     data = mj.MjData(model)
     for _ in range(25):
         mj.mj_step(model, data)
@@ -99,9 +112,13 @@ def test_from_mujoco_has_velocities_keys_and_no_guess():
     dt = model.opt.timestep
     after = problem.velocity(adapter.impulse(model, data))
     np.testing.assert_allclose(after, data.qvel + dt * data.qacc, atol=1e-6)
-    assert problem.guess is None  # MuJoCo's answer is no start: who times a solve from it times nothing
+    assert (
+        problem.guess is None
+    )  # MuJoCo's answer is no start: who times a solve from it times nothing
     assert lv.solve(problem, "newton", tol=1e-6).iterations > 0
-    assert lv.solve(problem, "newton", tol=1e-6, impulse=adapter.impulse(model, data)).iterations == 0
+    assert (
+        lv.solve(problem, "newton", tol=1e-6, impulse=adapter.impulse(model, data)).iterations == 0
+    )
     assert len(np.unique(problem.key)) == problem.n_blocks
     names = list(problem.names)
     keys = problem.key
@@ -146,7 +163,9 @@ def test_from_mujoco_without_efc_r_reads_its_inverse():
     model, data = state()
     right = lv.io.from_mujoco(model, data)
     data.efc_R[:] = 0.0
-    np.testing.assert_allclose(lv.io.from_mujoco(model, data).compliance, right.compliance, rtol=1e-14)
+    np.testing.assert_allclose(
+        lv.io.from_mujoco(model, data).compliance, right.compliance, rtol=1e-14
+    )
     data.efc_R[:] = 3.0
     with pytest.raises(lv.CapabilityError, match="efc_R and 1 / efc_D differ"):
         lv.io.from_mujoco(model, data)
@@ -164,7 +183,11 @@ def test_from_mujoco_of_an_edited_model_reads_the_new_values(jacobian):
         mj.mj_forward(model, data)
         fresh = copy.copy(model)
         other = mj.MjData(fresh)
-        other.qpos[:], other.qvel[:], other.qacc_warmstart[:] = data.qpos, data.qvel, data.qacc_warmstart
+        other.qpos[:], other.qvel[:], other.qacc_warmstart[:] = (
+            data.qpos,
+            data.qvel,
+            data.qacc_warmstart,
+        )
         mj.mj_forward(fresh, other)
         found = lv.io.from_mujoco(model, data)
         assert found == lv.io.from_mujoco(fresh, other) != before
@@ -204,11 +227,15 @@ FLEXES = {
 
 
 @pytest.mark.parametrize("kind", FLEXES)
-@pytest.mark.parametrize(("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)])
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)]
+)
 def test_solve_of_a_flex_gives_the_acceleration_of_mujoco(cone, condim, kind):
     more, edge = FLEXES[kind]
     try:
-        model = mj.MjModel.from_xml_string(CLOTH.format(cone=cone, condim=condim, more=more, edge=edge))
+        model = mj.MjModel.from_xml_string(
+            CLOTH.format(cone=cone, condim=condim, more=more, edge=edge)
+        )
     except ValueError as error:
         pytest.skip(f"this MuJoCo does not know it: {error}")
     data = mj.MjData(model)
@@ -244,12 +271,23 @@ def test_from_mujoco_after_a_step_of_rk4_reads_the_mean_acceleration_of_four_pas
         assert np.abs(own - data.qacc).max() > 1e-2
     mj.mj_forward(model, data)
     solution = lv.solve(lv.io.from_mujoco(model, data), tol=1e-10)
-    np.testing.assert_allclose(adapter.acceleration(model, data, solution.impulse), data.qacc, atol=1e-5)
+    np.testing.assert_allclose(
+        adapter.acceleration(model, data, solution.impulse), data.qacc, atol=1e-5
+    )
 
 
 # -- data that were changed -----------------------------------------------------------------------------
 
-INDICES = ("efc_id", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "M_colind", "M_rowadr", "M_rownnz")
+INDICES = (
+    "efc_id",
+    "efc_J_colind",
+    "efc_J_rowadr",
+    "efc_J_rownnz",
+    "dim",
+    "M_colind",
+    "M_rowadr",
+    "M_rownnz",
+)
 NUMBERS = ("qacc", "qvel", "qacc_smooth", "efc_aref", "efc_force", "efc_vel", "efc_J", "efc_R", "M")
 
 
@@ -275,7 +313,9 @@ def test_from_mujoco_with_a_changed_array_raises_or_reads_the_same_problem(name,
         model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{way}")
     mj.mj_forward(model, data)
     right = lv.io.from_mujoco(model, data)
-    array = getattr(model if name.startswith("M_") else data.contact if name == "dim" else data, name)
+    array = getattr(
+        model if name.startswith("M_") else data.contact if name == "dim" else data, name
+    )
     before = np.array(array)
     n = len(array)
     said = []
@@ -302,7 +342,9 @@ def test_from_mujoco_keeps_only_constant_arrays_of_a_model_and_releases_it():
         whole = getattr(model, name)
         kept = int(whole[-1])
         whole[-1] = 1000
-        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid do not describe a tree"):
+        with pytest.raises(
+            lv.InputError, match="dof_bodyid and body_parentid do not describe a tree"
+        ):
             lv.io.from_mujoco(model, data)
         whole[-1] = kept
     alive = weakref.ref(model)
@@ -396,7 +438,9 @@ def test_from_mujoco_with_data_of_another_model_raises():
     text = scene()
     # As many velocities, of six joints where one was.
     ways = "".join(
-        f'<joint type="{kind}" axis="{axis}"/>' for kind in ("slide", "hinge") for axis in ("1 0 0", "0 1 0", "0 0 1")
+        f'<joint type="{kind}" axis="{axis}"/>'
+        for kind in ("slide", "hinge")
+        for axis in ("1 0 0", "0 1 0", "0 0 1")
     )
     bob = '<body name="bob" pos="0 2 1">'
     other = mj.MjModel.from_xml_string(text.replace(f"{bob}<freejoint/>", bob + ways))

@@ -23,7 +23,11 @@ BALL = '<body pos=".8 0 .09"><freejoint/><geom size=".1"/></body>'
 
 def make_sheet(elastic="both", contact=""):
     return FLEX.format(
-        count="4 4 1", dim=2, dof="full", contact=contact, elasticity=f'thickness="4e-3" elastic2d="{elastic}"'
+        count="4 4 1",
+        dim=2,
+        dof="full",
+        contact=contact,
+        elasticity=f'thickness="4e-3" elastic2d="{elastic}"',
     )
 
 
@@ -38,17 +42,25 @@ ACTUATORS = """<actuator><position joint="shoulder" kp="100" kv="3"/><velocity j
 MODELS = {
     "damped hinge": MODEL.format(options="", bodies=make_arm('damping=".3"'), more=""),
     "stiff ball joint": MODEL.format(
-        options="", bodies=make_arm('stiffness="20"', 'type="ball" stiffness="10" damping="1"'), more=""
+        options="",
+        bodies=make_arm('stiffness="20"', 'type="ball" stiffness="10" damping="1"'),
+        more="",
     ),
     "fluid": MODEL.format(options='density="1000" viscosity="1"', bodies=make_arm(), more=""),
     "tendons": MODEL.format(options="", bodies=make_arm(), more=TENDONS),
     "actuators": MODEL.format(options="", bodies=make_arm(), more=ACTUATORS),
-    "PGS": MODEL.format(options='solver="PGS"', bodies=make_arm('damping=".3"'), more=TENDONS + ACTUATORS),
+    "PGS": MODEL.format(
+        options='solver="PGS"', bodies=make_arm('damping=".3"'), more=TENDONS + ACTUATORS
+    ),
     "stretched sheet": MODEL.format(options="", bodies=make_sheet("stretch"), more=""),
     "bent sheet": MODEL.format(options="", bodies=make_sheet("bend"), more=""),
-    "passive contact": MODEL.format(options="", bodies=make_sheet(contact='passive="true"') + BALL, more=""),
+    "passive contact": MODEL.format(
+        options="", bodies=make_sheet(contact='passive="true"') + BALL, more=""
+    ),
     "trilinear solid": MODEL.format(
-        options="", bodies=FLEX.format(count="3 3 3", dim=3, dof="trilinear", contact="", elasticity=""), more=""
+        options="",
+        bodies=FLEX.format(count="3 3 3", dim=3, dof="trilinear", contact="", elasticity=""),
+        more="",
     ),
 }
 
@@ -131,15 +143,21 @@ def test_from_mujoco_many_of_discrete_steps_equals_from_mujoco(name):
         problem = lv.io.from_mujoco(model, forward(model, state))
         world = imported.batch[i]
         mass = problem.generalized.mass.toarray()
-        assert world.generalized.mass.toarray() == pytest.approx(mass, abs=1e-14 * np.abs(mass).max())
+        assert world.generalized.mass.toarray() == pytest.approx(
+            mass, abs=1e-14 * np.abs(mass).max()
+        )
         assert world.b == pytest.approx(problem.b, abs=1e-12 * np.abs(problem.b).max())
 
 
 def test_from_mujoco_of_a_flex_without_stored_stiffness_raises():
     # Conjugate gradients multiply by the bending stiffness without storing it.
-    model = mj.MjModel.from_xml_string(MODEL.format(options='solver="CG"', bodies=make_sheet("bend") + BALL, more=""))
+    model = mj.MjModel.from_xml_string(
+        MODEL.format(options='solver="CG"', bodies=make_sheet("bend") + BALL, more="")
+    )
     data = mj.MjData(model)
-    mj.mj_forward(model, data)  # The sheet falls as a whole, so that its stiffness does not act on qacc_smooth.
+    mj.mj_forward(
+        model, data
+    )  # The sheet falls as a whole, so that its stiffness does not act on qacc_smooth.
     for convert in (
         lambda: lv.io.from_mujoco(model, data),
         lambda: lv.io.from_mujoco_many(model, np.r_[data.qpos, data.qvel][None]),
@@ -159,7 +177,9 @@ def test_from_mujoco_of_discrete_data_that_were_changed_names_the_arrays():
 def test_from_mujoco_of_a_discrete_step_does_not_depend_on_the_iterations_of_mujoco():
     model, states = make_states(MODELS["tendons"])
     exact = lv.io.from_mujoco(model, forward(model, states[-1]))
-    model.opt.iterations = 1  # MuJoCo then computes qacc_smooth with one iteration, too, and warns of it.
+    model.opt.iterations = (
+        1  # MuJoCo then computes qacc_smooth with one iteration, too, and warns of it.
+    )
     data = forward(model, states[-1])
     assert data.warning[int(mj.mjtWarning.mjWARN_INERTIA)].number
     early = lv.io.from_mujoco(model, data)

@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import CONTACTS, FORMS, random_contact_problem, random_generalized_problem, random_lcp, seeds
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    random_contact_problem,
+    random_generalized_problem,
+    random_lcp,
+    seeds,
+)
 
 import lavender as lv
 import lavender.io
@@ -24,7 +31,11 @@ def variants():
     rows = random_contact_problem(1)
     k = rows.n_blocks
     a = sp.csr_array(
-        np.where(np.random.default_rng(0).random((9, 9)) < 0.3, np.random.default_rng(1).random((9, 9)), 0.0)
+        np.where(
+            np.random.default_rng(0).random((9, 9)) < 0.3,
+            np.random.default_rng(1).random((9, 9)),
+            0.0,
+        )
     )
     a.data[0] = 0.0  # a stored zero is kept
     kept = {
@@ -33,7 +44,9 @@ def variants():
         "names": ['hinge "7"', "Gelenk ä, \ud800", "nul\0", *(f"block {i}" for i in range(3, k))],
         "name": "a\\name\n",
     }
-    single = {f.name: getattr(rows.rows, f.name) for f in dataclasses.fields(lv.Rows) if f.name != "copy"}
+    single = {
+        f.name: getattr(rows.rows, f.name) for f in dataclasses.fields(lv.Rows) if f.name != "copy"
+    }
     single = {key: x.astype(np.float32) if x.dtype == float else x for key, x in single.items()}
     yield "rows, everything", dataclasses.replace(rows, **kept)
     yield "rows, cone law", rows.relaxed("cone")
@@ -72,7 +85,9 @@ def variants():
     )
 
 
-@pytest.mark.parametrize("problem", [pytest.param(problem, id=name) for name, problem in variants()])
+@pytest.mark.parametrize(
+    "problem", [pytest.param(problem, id=name) for name, problem in variants()]
+)
 def test_save_and_load_of_npz_keeps_the_problem(tmp_path, problem):
     path = tmp_path / "problem.npz"
     impulse = np.linspace(0.0, 1.0, problem.m)
@@ -141,7 +156,13 @@ def own(tmp_path, problem=None, **changes):
 
 def npy(descr, shape, data=b"", fortran=False, version=1):
     header = repr({"descr": descr, "fortran_order": fortran, "shape": shape}).encode() + b"\n"
-    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H" if version == 1 else "<I", len(header)) + header + data
+    return (
+        b"\x93NUMPY"
+        + bytes([version, 0])
+        + struct.pack("<H" if version == 1 else "<I", len(header))
+        + header
+        + data
+    )
 
 
 class Bomb:
@@ -152,8 +173,15 @@ class Bomb:
 def test_load_of_an_npz_unpickles_nothing(tmp_path, monkeypatch):
     trace = tmp_path / "executed"
     monkeypatch.setenv("LAVENDER_TEST_BOMB", str(trace))
-    for entry in (np.array(Bomb(), object), npy("|O", (1,), pickle.dumps(Bomb())), pickle.dumps(Bomb())):
-        for path in (own(tmp_path, b=entry), archive(tmp_path / "box.npz", {"b": entry, "lo": 0, "hi": 0, "A": 0})):
+    for entry in (
+        np.array(Bomb(), object),
+        npy("|O", (1,), pickle.dumps(Bomb())),
+        pickle.dumps(Bomb()),
+    ):
+        for path in (
+            own(tmp_path, b=entry),
+            archive(tmp_path / "box.npz", {"b": entry, "lo": 0, "hi": 0, "A": 0}),
+        ):
             with pytest.raises(lv.InputError, match="'b'"):
                 lavender.io.load(path)
     assert not trace.exists()
@@ -176,7 +204,10 @@ def compressed(arrays, keys="PGA"):
     entries = {name: x for name, x in arrays.items() if name not in keys}
     for key in keys:
         matrix = sp.csc_array(arrays[key])
-        entries |= {f"{key}_{part}": getattr(matrix, part) for part in ("data", "indices", "indptr", "shape")}
+        entries |= {
+            f"{key}_{part}": getattr(matrix, part)
+            for part in ("data", "indices", "indptr", "shape")
+        }
     return entries
 
 
@@ -211,7 +242,12 @@ def test_a_plain_archive_of_arrays_is_a_program(tmp_path, keys):
 def box(tmp_path, **changes):
     rng = np.random.default_rng(0)
     g = rng.normal(size=(7, 7))
-    entries = {"A": g @ g.T, "b": rng.normal(size=7), "lo": np.zeros(7), "hi": np.full(7, np.inf)} | changes
+    entries = {
+        "A": g @ g.T,
+        "b": rng.normal(size=7),
+        "lo": np.zeros(7),
+        "hi": np.full(7, np.inf),
+    } | changes
     return archive(tmp_path / "box.npz", {n: v for n, v in entries.items() if v is not None})
 
 
@@ -237,7 +273,13 @@ def test_load_of_box_npz_keeps_rows_and_contacts_in_order(tmp_path):
 def test_load_of_box_npz_reads_sparse_matrices_and_any_number_type(tmp_path):
     rng = np.random.default_rng(1)
     a = sp.csr_array(np.where(rng.random((7, 7)) < 0.4, rng.random((7, 7)), 0.0))
-    parts = {"A": None, "A_data": a.data, "A_indices": a.indices, "A_indptr": a.indptr, "A_shape": np.array(a.shape)}
+    parts = {
+        "A": None,
+        "A_data": a.data,
+        "A_indices": a.indices,
+        "A_indptr": a.indptr,
+        "A_shape": np.array(a.shape),
+    }
     problem = lavender.io.load(box(tmp_path, **parts))
     assert np.array_equal(problem.dense(), a.toarray())
     whole = lavender.io.load(
@@ -248,7 +290,9 @@ def test_load_of_box_npz_reads_sparse_matrices_and_any_number_type(tmp_path):
 
 
 def test_documentation_lists_every_entry_of_npz(tmp_path):
-    text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parent.parent.parent / "docs" / "formats.md").read_text(
+        encoding="utf-8"
+    )
     for _, problem in variants():
         lavender.io.save(problem, tmp_path / "p.npz", impulse=np.zeros(problem.m))
         with np.load(tmp_path / "p.npz") as saved:
@@ -266,7 +310,10 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"lavender_format": np.array([1, 1])}, "this lavender reads 1"),
         ({"A": None}, "no entry 'A_shape'"),
         ({"cones_mu": None}, "no entry 'cones_mu'"),
-        *(({"meta": np.frombuffer(text, np.uint8)}, "JSON") for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)),
+        *(
+            ({"meta": np.frombuffer(text, np.uint8)}, "JSON")
+            for text in (b"{", b"[]", b"\xff\xfe", b"[" * 100_000)
+        ),
         ({"meta": {k: x for k, x in META.items() if k != "names"}}, "entry 'meta' has no names"),
         *(
             ({"meta": META | change}, words)
@@ -282,7 +329,8 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
 )
 def test_load_of_npz_with_other_entries_or_metadata_names_them(tmp_path, changes, sign):
     changes = {
-        k: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v for k, v in changes.items()
+        k: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v
+        for k, v in changes.items()
     }
     with pytest.raises(lv.InputError, match=rf"(?s)own\.npz.*{sign}"):
         lavender.io.load(own(tmp_path, **changes))

@@ -5,7 +5,9 @@ import pytest
 
 import lavender as lv
 
-pin = pytest.importorskip("pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'")
+pin = pytest.importorskip(
+    "pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'"
+)
 
 
 def robot(seed=0):
@@ -14,8 +16,12 @@ def robot(seed=0):
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.appendBodyToJoint(base, pin.Inertia.FromBox(1.0, 0.2, 0.3, 0.2), pin.SE3.Identity())
-    arm = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])), "arm")
-    model.appendBodyToJoint(arm, pin.Inertia.FromBox(0.5, 0.3, 0.05, 0.05), pin.SE3(np.eye(3), np.array([0.15, 0, 0])))
+    arm = model.addJoint(
+        base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])), "arm"
+    )
+    model.appendBodyToJoint(
+        arm, pin.Inertia.FromBox(0.5, 0.3, 0.05, 0.05), pin.SE3(np.eye(3), np.array([0.15, 0, 0]))
+    )
     model.lowerPositionLimit[-1], model.upperPositionLimit[-1] = -0.01, 0.5
     model.upperDryFrictionLimit[-1], model.lowerDryFrictionLimit[-1] = 0.7, -0.7
     q = pin.neutral(model)
@@ -26,7 +32,9 @@ def robot(seed=0):
     contact = pin.PointContactConstraintModel(model, 0, ground, base, corner)
     contact.setFriction(0.4)
     tip = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.0]))
-    anchor = pin.PointAnchorConstraintModel(model, 0, pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.1])), arm, tip)
+    anchor = pin.PointAnchorConstraintModel(
+        model, 0, pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.1])), arm, tip
+    )
     models = [
         anchor,
         contact,
@@ -58,7 +66,9 @@ def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
     assert (problem.operator, problem.law, problem.m) == ("generalized", "coulomb", 3 + 3 + 2 + 1)
     assert problem.row_name(3) == "PointContact 1, normal"
     data = model.createData()
-    np.testing.assert_allclose(problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12)
+    np.testing.assert_allclose(
+        problem.generalized.v_free, v + 0.01 * pin.aba(model, data, q, v, tau), atol=1e-12
+    )
     # J by differences of the two points' places, which Pinocchio's forward kinematics moves.
     h = 1e-6
     jac = problem.jacobian.toarray()
@@ -66,7 +76,9 @@ def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
 
     def places(q):
         pin.forwardKinematics(model, data, q)
-        return data.oMi[base].act(np.array([0.1, 0.1, -0.1])), data.oMi[arm].act(np.array([0.3, 0.0, 0.0]))
+        return data.oMi[base].act(np.array([0.1, 0.1, -0.1])), data.oMi[arm].act(
+            np.array([0.3, 0.0, 0.0])
+        )
 
     for k in range(model.nv):
         step = np.zeros(model.nv)
@@ -74,7 +86,9 @@ def test_from_pinocchio_rows_and_velocity_are_those_of_pinocchio():
         ahead = places(pin.integrate(model, q, step))
         behind = places(pin.integrate(model, q, -step))
         corner, tip = ((x - y) / (2.0 * h) for x, y in zip(ahead, behind, strict=True))
-        np.testing.assert_allclose(jac[3:6, k], corner[[2, 0, 1]], atol=1e-8)  # 1e-6 squared, and rounding over it
+        np.testing.assert_allclose(
+            jac[3:6, k], corner[[2, 0, 1]], atol=1e-8
+        )  # 1e-6 squared, and rounding over it
         np.testing.assert_allclose(jac[0:3, k], tip, atol=1e-8)
     np.testing.assert_array_equal(jac[6:, :6], 0.0)
     np.testing.assert_array_equal(jac[6:, 6], [1.0, -1.0, 1.0])
@@ -92,7 +106,9 @@ def test_from_pinocchio_solution_keeps_every_constraint_for_a_step():
     # First order in dt: the points are off by what the step turns, some (dt |v|)^2.
     assert data.oMi[1].act(np.array([0.1, 0.1, -0.1]))[2] > -1e-5
     assert after[-1] > model.lowerPositionLimit[-1] - 1e-5
-    np.testing.assert_allclose(data.oMi[2].act(np.array([0.3, 0.0, 0.0])), [0.4, 0.0, 0.1], atol=1e-5)
+    np.testing.assert_allclose(
+        data.oMi[2].act(np.array([0.3, 0.0, 0.0])), [0.4, 0.0, 0.1], atol=1e-5
+    )
     assert abs(solution.impulse[-1]) <= 0.7 * dt * (1.0 + 1e-12)
 
 
@@ -111,11 +127,14 @@ def test_from_pinocchio_measures_joint_limits_at_q():
     np.testing.assert_allclose(found, np.concatenate([measured + 0.3, 0.4 - measured]))
     for k, step in enumerate(1e-6 * np.eye(model.nv)):
         ahead, behind = (gaps(pin.integrate(model, q, x))[1] for x in (step, -step))
-        np.testing.assert_allclose(problem.jacobian.toarray()[:, k], (ahead - behind) / 2e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            problem.jacobian.toarray()[:, k], (ahead - behind) / 2e-6, atol=1e-7
+        )
 
 
 @pytest.mark.parametrize(
-    ("kind", "units"), [("RX", "r"), ("PZ", "m"), ("RUBX", "r"), ("Spherical", "rrr"), ("FreeFlyer", "mmmrrr")]
+    ("kind", "units"),
+    [("RX", "r"), ("PZ", "m"), ("RUBX", "r"), ("Spherical", "rrr"), ("FreeFlyer", "mmmrrr")],
 )
 def test_from_pinocchio_rows_of_joints_and_anchors_have_the_unit_of_their_velocity(kind, units):
     model = pin.Model()
@@ -128,7 +147,17 @@ def test_from_pinocchio_rows_of_joints_and_anchors_have_the_unit_of_their_veloci
     assert "".join(problem.row_unit(i)[0] for i in range(problem.m)) == units + "mmmrrr"
 
 
-KINDS = ("RX", "PZ", "RUBX", "Spherical", "SphericalZYX", "Planar", "Translation", "FreeFlyer", "RevoluteUnaligned")
+KINDS = (
+    "RX",
+    "PZ",
+    "RUBX",
+    "Spherical",
+    "SphericalZYX",
+    "Planar",
+    "Translation",
+    "FreeFlyer",
+    "RevoluteUnaligned",
+)
 
 
 def vectors(joint):
@@ -155,7 +184,10 @@ def test_from_pinocchio_limits_and_friction_hold_in_its_own_dynamics(seed):
     tau = rng.normal(size=model.nv)
     dt = 0.01
     joints = list(range(1, model.njoints))
-    models = [pin.JointLimitConstraintModel(model, joints), pin.JointFrictionConstraintModel(model, joints)]
+    models = [
+        pin.JointLimitConstraintModel(model, joints),
+        pin.JointFrictionConstraintModel(model, joints),
+    ]
     problem = problem_of(model, models, q, v, dt, tau=tau, correction=1.0)
     solution = lv.solve(problem, tol=1e-10, max_iter=20_000).raise_for_status()
     own = solution.impulse
@@ -202,11 +234,17 @@ def anchored_chain(kind):
     rng = np.random.default_rng(1)
     q = rng.normal(size=4)
     pin.forwardKinematics(model, data, q)
-    anchor = getattr(pin, f"{kind}AnchorConstraintModel")(model, 0, data.oMi[parent] * tip, parent, tip)
+    anchor = getattr(pin, f"{kind}AnchorConstraintModel")(
+        model, 0, data.oMi[parent] * tip, parent, tip
+    )
     pin.computeJointJacobians(model, data, q)
     turn = (data.oMi[parent] * tip).rotation
-    jac = (turn @ (tip.inverse().action @ pin.getJointJacobian(model, data, parent, pin.LOCAL))[:3])[[0, 2]]
-    jac = np.vstack([jac, np.ones((1, 4))]) if kind == "Frame" else jac  # The hinges turn about one axis.
+    jac = (
+        turn @ (tip.inverse().action @ pin.getJointJacobian(model, data, parent, pin.LOCAL))[:3]
+    )[[0, 2]]
+    jac = (
+        np.vstack([jac, np.ones((1, 4))]) if kind == "Frame" else jac
+    )  # The hinges turn about one axis.
     kernel = np.linalg.svd(jac)[2][len(jac) :]
     v = kernel.T @ rng.normal(size=len(kernel))
     pin.forwardKinematics(model, data, q, v, np.zeros(4))
@@ -231,7 +269,9 @@ def test_from_pinocchio_acceleration_level_gives_the_constrained_acceleration(ki
         return (problem.velocity(lv.solve(problem, tol=1e-13).impulse) - v) / dt
 
     np.testing.assert_allclose(accelerate("acceleration"), exact, atol=1e-8 * np.abs(exact).max())
-    assert np.abs(accelerate("velocity") - exact).max() > 1e-3 * np.abs(exact).max()  # Its error does not depend on dt.
+    assert (
+        np.abs(accelerate("velocity") - exact).max() > 1e-3 * np.abs(exact).max()
+    )  # Its error does not depend on dt.
 
 
 def test_from_pinocchio_friction_with_another_time_step_names_set_time_step():
@@ -239,5 +279,9 @@ def test_from_pinocchio_friction_with_another_time_step_names_set_time_step():
     if not hasattr(models[3], "setTimeStep"):
         pytest.skip("this version of Pinocchio has no time step of joint friction")
     models[3].setTimeStep(1.0)
-    with pytest.raises(lv.InputError, match=r"time step of 1 s, and dt is 0.01 s: .* setTimeStep\(0.01\)"):
-        lv.io.from_pinocchio(model, model.createData(), models, [m.createData() for m in models], 0.01, q=q, v=v)
+    with pytest.raises(
+        lv.InputError, match=r"time step of 1 s, and dt is 0.01 s: .* setTimeStep\(0.01\)"
+    ):
+        lv.io.from_pinocchio(
+            model, model.createData(), models, [m.createData() for m in models], 0.01, q=q, v=v
+        )

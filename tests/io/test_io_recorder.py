@@ -15,7 +15,9 @@ def batch_of(v_free):
     """Blocks of 1 kg on the ground, one world for each velocity (n, 2) [m/s]: tangent, normal."""
     n = len(v_free)
     jac = np.broadcast_to(np.eye(2)[::-1], (n, 2, 2)).copy()
-    return lv.Batch(jac, np.broadcast_to(np.eye(2), (n, 2, 2)).copy(), np.array(v_free, float), cones=CONES)
+    return lv.Batch(
+        jac, np.broadcast_to(np.eye(2), (n, 2, 2)).copy(), np.array(v_free, float), cones=CONES
+    )
 
 
 def step_of(errors, nan=()):
@@ -25,7 +27,9 @@ def step_of(errors, nan=()):
     batch = batch_of(v_free)
     impulse = np.tile([1.0, 0.0], (len(errors), 1))
     impulse[:, 0] -= errors
-    claims = lv.io.Claims(np.array(errors) < 0.05, np.arange(len(errors)), {"r_p": np.array(errors, float)})
+    claims = lv.io.Claims(
+        np.array(errors) < 0.05, np.arange(len(errors)), {"r_p": np.array(errors, float)}
+    )
     return lv.io.EngineStep(batch, impulse, claims)
 
 
@@ -39,7 +43,9 @@ def test_recorder_keeps_the_worst_answers_of_all_steps(tmp_path):
     with lv.io.Recorder(tmp_path / "worst", keep_worst=4) as recorder:
         for errors in steps:
             recorder.add(step_of(errors), state={"position": np.arange(5.0)[:, None]})
-    ranked = sorted(((e, s, w) for s, row in enumerate(steps) for w, e in enumerate(row)), reverse=True)[:4]
+    ranked = sorted(
+        ((e, s, w) for s, row in enumerate(steps) for w, e in enumerate(row)), reverse=True
+    )[:4]
     expected = {f"step_{s:06d}_world_{w:04d}.npz": (e, w) for e, s, w in ranked}
     assert set(recorder.files) == set(expected)
     assert {p.name for p in (tmp_path / "worst").glob("*.npz")} == set(expected)
@@ -55,7 +61,9 @@ def test_recorder_keeps_the_worst_answers_of_all_steps(tmp_path):
 
 
 def test_recorder_with_every_and_when_keeps_selected_and_worst_steps(tmp_path):
-    with lv.io.Recorder(tmp_path / "a", every=3, keep_worst=1, when=lambda v: v.claimed and v.world == 1) as recorder:
+    with lv.io.Recorder(
+        tmp_path / "a", every=3, keep_worst=1, when=lambda v: v.claimed and v.world == 1
+    ) as recorder:
         for _ in range(5):
             recorder.add(step_of([0.3, 0.01]))
     wanted = {(s, w) for s in (0, 3) for w in (0, 1)} | {(s, 1) for s in range(5)}
@@ -111,7 +119,9 @@ def test_recorder_with_wrong_arguments_or_folders_raises(tmp_path):
         lv.io.Recorder(tmp_path / "a", when=3)
     with lv.io.Recorder(tmp_path / "a", every=1) as recorder:
         recorder.add(step_of([0.1]))
-        with pytest.raises(lv.InputError, match=r"state 'q' has shape \(3,\); \(1 worlds, ...\) is needed"):
+        with pytest.raises(
+            lv.InputError, match=r"state 'q' has shape \(3,\); \(1 worlds, ...\) is needed"
+        ):
             recorder.add(step_of([0.1]), state={"q": np.zeros(3)})
     with pytest.raises(lv.InputError, match="holds 1 problem files"):
         lv.io.Recorder(tmp_path / "a", every=1)

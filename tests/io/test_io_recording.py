@@ -19,7 +19,9 @@ def test_record_writes_a_folder_of_problems_with_the_answers_of_the_engine(tmp_p
     found = lv.io.record(model, data, tmp_path / "steps", 40, every=10)
     assert len(found.files) == 4
     assert found.left_out == ()
-    lines = [json.loads(line) for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()
+    ]
     assert [line["file"] for line in lines] == list(found.files)
     for line in lines:
         stored = lv.io.read(tmp_path / "steps" / line["file"])
@@ -54,7 +56,10 @@ def test_record_ctrl_c_keeps_the_steps_until_then(tmp_path):
     found = lv.io.record(*state(steps=1), tmp_path, 20, control=interrupt)
     lines = [json.loads(line) for line in (tmp_path / "engine.jsonl").read_text().splitlines()]
     assert found.is_interrupted and [line["file"] for line in lines] == list(found.files)
-    assert sorted(path.name for path in tmp_path.glob("*.npz")) == list(found.files) and len(lines) == 5
+    assert (
+        sorted(path.name for path in tmp_path.glob("*.npz")) == list(found.files)
+        and len(lines) == 5
+    )
     assert len(lv.report.resolve_sources(tmp_path)) == 5
 
 
@@ -63,18 +68,26 @@ def test_record_from_different_states_makes_independent_steps(tmp_path):
     arrays = {"qpos": np.tile(data.qpos, (3, 1)), "qvel": np.tile(data.qvel, (3, 1))}
     found = lv.io.record(model, data, tmp_path / "six", 6, states=arrays)
     assert "from 3 start states; steps from different states are independent" in str(found)
-    lines = [json.loads(line) for line in (tmp_path / "six" / "engine.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "six" / "engine.jsonl").read_text().splitlines()
+    ]
     assert [line["start"] for line in lines] == [0, 0, 1, 1, 2, 2]
     items = lv.report.resolve_sources(tmp_path / "six")
     assert [(i.sequence, i.step) for i in items[2:4]] == [("six, state 1", 0), ("six, state 1", 1)]
     lv.io.record(model, data, tmp_path / "three", 3, states=arrays)
     # A single step of each state is a single problem, which is solved cold.
     items = lv.report.resolve_sources(tmp_path / "three", sequences=True)
-    assert [(i.name, i.sequence, i.step) for i in items] == [(f"three, state {k}", "", -1) for k in range(3)]
+    assert [(i.name, i.sequence, i.step) for i in items] == [
+        (f"three, state {k}", "", -1) for k in range(3)
+    ]
 
 
-@pytest.mark.parametrize(("steps", "every", "count"), [(20, 1, 3), (20, 2, 3), (17, 3, 5), (9, 4, 1)])
-def test_steps_from_start_states_are_counted_from_each_and_begin_under_its_controls(steps, every, count):
+@pytest.mark.parametrize(
+    ("steps", "every", "count"), [(20, 1, 3), (20, 2, 3), (17, 3, 5), (9, 4, 1)]
+)
+def test_steps_from_start_states_are_counted_from_each_and_begin_under_its_controls(
+    steps, every, count
+):
     model, data = state(steps=1)
     vectors = np.empty((9, mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)))
     for row in vectors:
@@ -82,7 +95,10 @@ def test_steps_from_start_states_are_counted_from_each_and_begin_under_its_contr
         mj.mj_getState(model, data, row, mj.mjtState.mjSTATE_INTEGRATION)
     starts = StartStates(vectors, controls=np.arange(9.0)[:, None]).select_evenly(count)
     kept = [9 * i // count for i in range(count)]
-    assert starts.vectors.tobytes() == vectors[kept].tobytes() and starts.controls.ravel().tolist() == kept
+    assert (
+        starts.vectors.tobytes() == vectors[kept].tobytes()
+        and starts.controls.ravel().tolist() == kept
+    )
     starts = replace(starts, controls=None)
     found = list(recording.iterate_steps(mj, model, data, steps, every, lambda *_: None, starts))
     ends = [steps * i // count for i in range(count + 1)]
@@ -102,7 +118,8 @@ def test_record_of_steps_that_cannot_be_exported_counts_them(tmp_path, monkeypat
 def make_row_of_boxes(n, options=""):
     """Return a model of n sliding boxes that do not touch each other, and its data after some steps."""
     boxes = "".join(
-        f'<body pos="{0.5 * i} 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(n)
+        f'<body pos="{0.5 * i} 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+        for i in range(n)
     )
     model = mj.MjModel.from_xml_string(
         f'<mujoco><option cone="elliptic" {options}/><worldbody><geom type="plane" size="99 9 .1"/>{boxes}'
@@ -119,7 +136,9 @@ def test_record_with_noslip_separates_its_iterations(tmp_path):
         model, data = make_row_of_boxes(2, options)
         mj.mj_resetData(model, data)  # At rest, noslip changes no velocity and so no later step.
         lv.io.record(model, data, tmp_path / f"n{len(lines)}", 1)
-        (line,) = map(json.loads, (tmp_path / f"n{len(lines)}" / "engine.jsonl").read_text().splitlines())
+        (line,) = map(
+            json.loads, (tmp_path / f"n{len(lines)}" / "engine.jsonl").read_text().splitlines()
+        )
         lines.append(line)
     assert np.sum(data.solver_niter) == lines[1]["iterations"] + lines[1]["noslip_iterations"]
     assert lines[0]["iterations"] == lines[1]["iterations"] > 0
@@ -145,7 +164,10 @@ def test_record_with_controls_plays_draws_or_calls_them(tmp_path):
     assert -2.0 <= data.ctrl[0] <= 3.0
     calls = [lambda *_, given=given: given for given in ([np.nan], [1.0, 2.0], "fast")]
     for given, words in (
-        *(({"control": wrong}, "control") for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls)),
+        *(
+            ({"control": wrong}, "control")
+            for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls)
+        ),
         ({"control": "random", "seed": -1}, "seed is -1"),
         ({"replace": "no"}, "replace is 'no'"),
         ({"steps": 0}, "steps is 0"),

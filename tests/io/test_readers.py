@@ -2,7 +2,14 @@
 
 import numpy as np
 import pytest
-from recorded_engines import MAX_ROWS, Recorded, make_genesis, make_kamino, make_newton_mujoco, replace_genesis
+from recorded_engines import (
+    MAX_ROWS,
+    Recorded,
+    make_genesis,
+    make_kamino,
+    make_newton_mujoco,
+    replace_genesis,
+)
 
 import lavender as lv
 
@@ -19,7 +26,9 @@ def read_kamino(model, **changes):
     """Read a step; return it with the engine's next velocity of each world."""
     solver = make_kamino(model, **changes)
     ends = np.cumsum(solver._solver_kamino._model.info.num_bodies.array)
-    return lv.io.from_kamino(solver), [x.ravel() for x in np.split(solver.velocity.array, ends[:-1])]
+    return lv.io.from_kamino(solver), [
+        x.ravel() for x in np.split(solver.velocity.array, ends[:-1])
+    ]
 
 
 def read_genesis(model, **changes):
@@ -36,9 +45,18 @@ def read_newton_mujoco(cone, **changes):
 
 
 READERS_BY_ENGINE = {
-    **{f"kamino, {m}": lambda m=m, **more: read_kamino(m, **more) for m in ("mixed", "stacks", "dvi")},
-    **{f"genesis, {m}": lambda m=m, **more: read_genesis(m, **more) for m in ("arm", "convex", "pyramids")},
-    **{f"newton's mujoco, {m}": lambda m=m, **more: read_newton_mujoco(m, **more) for m in ("elliptic", "pyramidal")},
+    **{
+        f"kamino, {m}": lambda m=m, **more: read_kamino(m, **more)
+        for m in ("mixed", "stacks", "dvi")
+    },
+    **{
+        f"genesis, {m}": lambda m=m, **more: read_genesis(m, **more)
+        for m in ("arm", "convex", "pyramids")
+    },
+    **{
+        f"newton's mujoco, {m}": lambda m=m, **more: read_newton_mujoco(m, **more)
+        for m in ("elliptic", "pyramidal")
+    },
 }
 
 
@@ -59,7 +77,11 @@ def test_reader_impulses_give_the_next_velocity_of_the_engine(name):
     step, after = READERS_BY_ENGINE[name]()
     assert step.claims.converged.shape == (len(step.batch),) and step.batch.precision == "float32"
     for i, problem in enumerate(step.batch):
-        impulse = step.impulse[step.batch.rows_of(i)] if step.impulse.ndim == 1 else step.impulse[i, : problem.m]
+        impulse = (
+            step.impulse[step.batch.rows_of(i)]
+            if step.impulse.ndim == 1
+            else step.impulse[i, : problem.m]
+        )
         assert np.abs(problem.velocity(impulse) - after[i]).max() <= VELOCITY_TOLERANCE
 
 
@@ -79,7 +101,9 @@ def test_reader_of_a_world_with_bad_numbers_has_no_answer_for_it_alone(name, wor
     found = lv.residual_many(step.batch, step.impulse, errors="status")
     assert np.flatnonzero(~np.isfinite(found.velocity_error)).tolist() == [world]
     assert set(found.faults) <= {world} and step.claims.converged.shape == (len(step.batch),)
-    clean = found if name == "kamino, stacks" else lv.residual_many(*READERS_BY_ENGINE[name]()[0][:2])
+    clean = (
+        found if name == "kamino, stacks" else lv.residual_many(*READERS_BY_ENGINE[name]()[0][:2])
+    )
     others = np.delete(np.arange(len(step.batch)), world)
     np.testing.assert_array_equal(found.relative[others], clean.relative[others])
 
@@ -88,7 +112,9 @@ def test_reader_of_a_world_with_bad_numbers_has_no_answer_for_it_alone(name, wor
 def test_reader_answers_of_mujoco_in_float32_are_right(cone):
     step, _ = read_newton_mujoco(cone)
     verdicts = lv.residual_many(step.batch, step.impulse, threshold=1e-4).verdict
-    assert set(verdicts.tolist()) <= {"at its floor", "close enough"} and step.claims.converged.all()
+    assert (
+        set(verdicts.tolist()) <= {"at its floor", "close enough"} and step.claims.converged.all()
+    )
     assert not any(dropped.any() for dropped in step.claims.residuals.values())
 
 
@@ -126,11 +152,20 @@ def flatten_inertia(x):
 
 KAMINO = (lv.io.from_kamino, make_kamino, "mixed")
 GENESIS = (lv.io.from_genesis, make_genesis, "arm")
-MUJOCO = (lambda solver: lv.io.from_newton_mujoco(solver, np.zeros((3, 1))), make_newton_mujoco, "elliptic")
+MUJOCO = (
+    lambda solver: lv.io.from_newton_mujoco(solver, np.zeros((3, 1))),
+    make_newton_mujoco,
+    "elliptic",
+)
 #: Reader, changes of arrays, change of the object, words of the CapabilityError.
 UNSUPPORTED = [
     (KAMINO, {"inv_m_i": lambda x: 1.01 * x}, None, r"world \d: the engine's matrix differs"),
-    ((*KAMINO[:2], "dvi"), {"nzb_coords": lambda x: x[:, ::-1]}, None, r"world \d: the engine's matrix differs"),
+    (
+        (*KAMINO[:2], "dvi"),
+        {"nzb_coords": lambda x: x[:, ::-1]},
+        None,
+        r"world \d: the engine's matrix differs",
+    ),
     (KAMINO, {"inv_I_i": flatten_inertia}, None, r"body 2 .* singular"),
     (KAMINO, {}, set_at("_solver_kamino._config.dynamics_solver", "lox"), "dynamics_solver='lox'"),
     (KAMINO, {}, set_at("_solver_kamino._config.sparse_dynamics", True), "sparse_dynamics=True"),
@@ -146,7 +181,9 @@ UNSUPPORTED = [
 ]
 
 
-@pytest.mark.parametrize(("reader", "arrays", "change", "words"), UNSUPPORTED, ids=[words for *_, words in UNSUPPORTED])
+@pytest.mark.parametrize(
+    ("reader", "arrays", "change", "words"), UNSUPPORTED, ids=[words for *_, words in UNSUPPORTED]
+)
 def test_reader_of_unsupported_data_raises_an_error_that_names_them(reader, arrays, change, words):
     read, make, model = reader
     given = make(model, **arrays)
@@ -158,7 +195,11 @@ def test_reader_of_unsupported_data_raises_an_error_that_names_them(reader, arra
 
 @pytest.mark.parametrize(
     ("read", "words"),
-    [(KAMINO[0], "a object; a newton"), (GENESIS[0], "a object; a built"), (MUJOCO[0], "SolverMuJoCo")],
+    [
+        (KAMINO[0], "a object; a newton"),
+        (GENESIS[0], "a object; a built"),
+        (MUJOCO[0], "SolverMuJoCo"),
+    ],
 )
 def test_reader_of_another_object_names_the_needed_type(read, words):
     with pytest.raises(lv.InputError, match=words):

@@ -54,7 +54,9 @@ def test_a_reference_problem_loads_and_its_solution_is_one(problem_dir, name, tm
 
 
 @pytest.mark.parametrize("solver", ["newton", "auto", "admm", "anderson", "nncg"])
-@pytest.mark.parametrize("name", [n for n in FILES if n.startswith("rfc3d_")] or [pytest.param("", id="no folder")])
+@pytest.mark.parametrize(
+    "name", [n for n in FILES if n.startswith("rfc3d_")] or [pytest.param("", id="no folder")]
+)
 def test_rolling_reference_problems_are_solved_as_their_reference(problem_dir, name, solver):
     stored = lavender.io.read(problem_dir / name)
     problem = stored.problem
@@ -72,7 +74,9 @@ def test_rolling_reference_problems_are_solved_as_their_reference(problem_dir, n
 
 @pytest.mark.parametrize("solver", lv.available(external=False, law="lcp", exact=True))
 def test_reference_problems_without_friction_are_solved_by_exact_solvers(problem_dir, solver):
-    problems = {name: lavender.io.load(problem_dir / name) for name in FILES if name.endswith(".npz")}
+    problems = {
+        name: lavender.io.load(problem_dir / name) for name in FILES if name.endswith(".npz")
+    }
     problems = {name: problem for name, problem in problems.items() if not any(problem.cones.kind)}
     assert len(problems) > 25
     for name, problem in problems.items():
@@ -81,12 +85,16 @@ def test_reference_problems_without_friction_are_solved_by_exact_solvers(problem
         if name == "lcpgen_psd-300.npz":
             assert found.status is lv.Status.INFEASIBLE, found
         elif solver == "direct" and found.status is lv.Status.STALLED:
-            assert not problem.is_symmetric, name  # where A is not monotone either, exchanges may have no end
+            assert not problem.is_symmetric, (
+                name
+            )  # where A is not monotone either, exchanges may have no end
         else:
             assert found.success or found.status is lv.Status.ROUNDOFF_LIMIT, (name, found)
 
 
-@pytest.mark.parametrize("name", [n for n in FILES if n.endswith(".hdf5")] or [pytest.param("", id="no folder")])
+@pytest.mark.parametrize(
+    "name", [n for n in FILES if n.endswith(".hdf5")] or [pytest.param("", id="no folder")]
+)
 def test_auto_solves_every_reference_problem_with_friction(problem_dir, name):
     """In one of them, A has stored zeros between the rows of islands on an immovable body."""
     found = lv.solve(lavender.io.load(problem_dir / name), "auto", tol=1e-6)

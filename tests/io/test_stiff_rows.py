@@ -98,7 +98,9 @@ def test_stiff_rows_of_many_worlds_equal_those_of_single_ones():
     many = lv.residual_many(imported.batch, imported.impulse)
     assert many.verdict.tolist() == [x.verdict for x in single]
     np.testing.assert_allclose(many.velocity_error, [x.velocity for x in single], atol=1e-14)
-    assert [many[i].lost_digits > 0 for i in range(len(many))] == [x.lost_digits > 0 for x in single]
+    assert [many[i].lost_digits > 0 for i in range(len(many))] == [
+        x.lost_digits > 0 for x in single
+    ]
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -138,7 +140,9 @@ def test_report_of_recorded_stiff_rows_keeps_the_error_of_the_acceleration(tmp_p
     with lv.io.Recorder(tmp_path / "lever", every=1, solver="mujoco") as recorder:
         for model, data in iterate_pressed_states(1):
             recorder.add(lv.io.from_mujoco(model, data), adapter.impulse(model, data))
-    lines = [json.loads(line) for line in (tmp_path / "lever" / "engine.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "lever" / "engine.jsonl").read_text().splitlines()
+    ]
     answers = read_engine_answers([str(tmp_path / "lever")], make_lines([]))
     assert any("lost_digits" in line for line in lines)
     assert answers["relative"].tolist() == [line["relative"] for line in lines]

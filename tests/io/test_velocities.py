@@ -25,7 +25,9 @@ def test_reconstruct_of_impulses_within_the_cones_leaves_nothing_over(form, seed
 def test_reconstruct_is_the_projection_of_the_motion_on_the_cone():
     """A particle of 2 kg: (1) is the projection of its momentum on the friction cone in closed form."""
     cones = lv.Cones.contacts(0.5, tangents=1)
-    problem = lv.Problem.from_jacobian(np.eye(2), 2.0 * np.eye(2), [-1.0, 3.0], cones=cones, compliance=1.0)
+    problem = lv.Problem.from_jacobian(
+        np.eye(2), 2.0 * np.eye(2), [-1.0, 3.0], cones=cones, compliance=1.0
+    )
     ray = np.array([1.0, -0.5]) / np.hypot(1.0, 0.5)  # Boundary of the cone against the sliding.
     for after, impulse in (
         ([0.0, 2.9], [2.0, -0.2]),
@@ -66,9 +68,15 @@ def test_recorder_with_velocities_stores_impulses_and_marks_them(tmp_path):
         recorder.add(problem, velocity=velocity)
         with pytest.raises(lv.InputError, match="velocity replaces the impulse"):
             recorder.add(problem, answer.impulse, velocity=velocity)
-    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()
+    ]
     assert [line["reconstructed"] for line in lines] == [True, True]
-    assert lines[0]["seconds"] == 0.002 and lines[0]["left_over"] < 1e-6 < 1e-3 < lines[1]["left_over"]
+    assert (
+        lines[0]["seconds"] == 0.002 and lines[0]["left_over"] < 1e-6 < 1e-3 < lines[1]["left_over"]
+    )
     stored = lv.io.read(tmp_path / "a" / lines[0]["file"])
-    np.testing.assert_allclose(problem.velocity(stored.impulse), problem.velocity(answer.impulse), atol=1e-6)
+    np.testing.assert_allclose(
+        problem.velocity(stored.impulse), problem.velocity(answer.impulse), atol=1e-6
+    )
     assert verdict.velocity_error == lv.residual(problem, stored.impulse).velocity

@@ -33,7 +33,10 @@ NUMBER = re.compile(r"(?<![\w.])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?(
 NUMERAL = r"(?<![\w.])([-+\d.e]*\d)(?!\d)"
 HEADING = re.compile(r"^#+ .*\n", re.MULTILINE)
 CLAIMS_TEXT = Path(__file__).with_name("chapter_claims.txt").read_text(encoding="utf-8")
-SECTIONS = [page + comments for page, comments in zip(HEADING.split(PAGE), HEADING.split(CLAIMS_TEXT), strict=True)]
+SECTIONS = [
+    page + comments
+    for page, comments in zip(HEADING.split(PAGE), HEADING.split(CLAIMS_TEXT), strict=True)
+]
 
 
 def value(text):
@@ -67,7 +70,9 @@ def printed(command):
         name = Path(words[1]).stem
         out = io.StringIO()
         with TemporaryDirectory() as folder, contextlib.redirect_stdout(out):
-            figure = Path(folder, f"{name}.png")  # the script's own name: all numbers and all panels
+            figure = Path(
+                folder, f"{name}.png"
+            )  # the script's own name: all numbers and all panels
             example(name).main(str(figure))
             assert figure.read_bytes().startswith(b"\x89PNG")
         return out.getvalue()
@@ -80,8 +85,12 @@ def printed(command):
 def check(numbers, tolerance, line, text):
     """The numbers are what the first such line says."""
     places = {"_": r"\S+", "…": ".*?"}
-    pattern = " ".join(places.get(w) or re.escape(w).replace(r"\{\}", NUMERAL) for w in line.split())
-    found = next(filter(None, (re.fullmatch(pattern, " ".join(x.split())) for x in text.splitlines())), None)
+    pattern = " ".join(
+        places.get(w) or re.escape(w).replace(r"\{\}", NUMERAL) for w in line.split()
+    )
+    found = next(
+        filter(None, (re.fullmatch(pattern, " ".join(x.split())) for x in text.splitlines())), None
+    )
     assert found, f"no line {line!r} in\n{text}"
     for number, shown in zip(numbers, found.groups(), strict=True):
         if number.startswith("<"):
@@ -91,12 +100,16 @@ def check(numbers, tolerance, line, text):
         unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
         allowed = float(tolerance) / 100.0 * value(number) if tolerance else 0.5 * unit
         # what is printed is decimal, too
-        assert abs(value(shown) - value(number)) <= allowed * (1.0 + 1e-9), f"{number}, but {found[0]!r} is printed"
+        assert abs(value(shown) - value(number)) <= allowed * (1.0 + 1e-9), (
+            f"{number}, but {found[0]!r} is printed"
+        )
 
 
 def claimed(by):
     """The numbers of all claims of some commands."""
-    return {number.lstrip("<") for found in by.values() for numbers, *_ in found for number in numbers}
+    return {
+        number.lstrip("<") for found in by.values() for numbers, *_ in found for number in numbers
+    }
 
 
 CLAIMS = claims(CLAIMS_TEXT)[0]
@@ -123,8 +136,12 @@ def test_claims_have_the_headings_of_the_pages():
 def test_chapter_panel_is_drawn_by_the_command_of_its_example():
     """Its picture is there without a build, and none is there that the page does not show."""
     pictures = ROOT / "docs" / "static" / "chapter"
-    shown = re.findall(r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE)
-    assert sorted(f"{file}.png" for file, *_ in shown) == sorted(path.name for path in pictures.iterdir())
+    shown = re.findall(
+        r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE
+    )
+    assert sorted(f"{file}.png" for file, *_ in shown) == sorted(
+        path.name for path in pictures.iterdir()
+    )
     assert len(shown) > 12 and PAGE.count("(static/chapter/") == len(shown)
     for file, name, panel in shown:
         assert file == panel and panel in example(name).PANELS
@@ -142,13 +159,24 @@ def test_chapter_panel_is_drawn_by_the_command_of_its_example():
 
 def test_chapter_panel_computes_only_its_own_curves(tmp_path, monkeypatch, capsys):
     module = example("engine_sweeps")
-    for name in ("solve_first", "judge", "run", "compare_orders", "predict_residual", "run_without_friction"):
+    for name in (
+        "solve_first",
+        "judge",
+        "run",
+        "compare_orders",
+        "predict_residual",
+        "run_without_friction",
+    ):
         monkeypatch.setattr(module, name, None)  # neither tables nor the other panels
     monkeypatch.setattr(module, "numbers", module.numbers.__wrapped__)
     monkeypatch.setattr(module, "LIMIT", 0.1)
     module.main(str(tmp_path / "stand.png"))
     assert capsys.readouterr().out == f"figure: {tmp_path / 'stand.png'}\n"
-    for name in {re.match(r"python examples/(\w+)\.py", command)[1] for command in CLAIMS if "examples/" in command}:
+    for name in {
+        re.match(r"python examples/(\w+)\.py", command)[1]
+        for command in CLAIMS
+        if "examples/" in command
+    }:
         assert len(example(name).numbers()) >= 1 and callable(example(name).print_numbers)
 
 
@@ -163,14 +191,21 @@ def test_chapter_figure_file_named_after_a_panel_holds_it_alone(tmp_path):
     module = example("two_particles")
     module.main(str(tmp_path / "two_particles.svg"))
     module.main(str(tmp_path / "distance.svg"))
-    whole, alone = ((tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in ("two_particles", "distance"))
+    whole, alone = (
+        (tmp_path / f"{name}.svg").read_text(encoding="utf-8")
+        for name in ("two_particles", "distance")
+    )
     assert [text.count('<g id="axes_') for text in (whole, alone)] == [len(module.PANELS), 1]
 
 
 def test_chapter_failure_has_a_command_that_shows_it():
-    tables = re.findall(r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    tables = re.findall(
+        r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE
+    )
     assert len(tables) == 5  # one for each experiment
-    rows = [re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()]
+    rows = [
+        re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()
+    ]
     assert len(rows) > 14
     for row in rows:
         command = row[-1].strip().strip("`")
@@ -180,7 +215,13 @@ def test_chapter_failure_has_a_command_that_shows_it():
 
 @pytest.mark.parametrize(
     ("number", "shown"),
-    [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060"), ("<1e-9", "1.1e-09")],
+    [
+        ("5e-4", "8.0e-04"),
+        ("15", "7.4"),
+        ("45.4", "45.6"),
+        ("0.40", "0.4060"),
+        ("<1e-9", "1.1e-09"),
+    ],
 )
 def test_chapter_comparison_detects_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):

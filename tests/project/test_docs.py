@@ -36,10 +36,18 @@ def blocks(page, *kinds):
 
 
 def modules_with_doctests():
-    names = (m.name for m in pkgutil.walk_packages(lv.__path__, "lavender.") if not m.name.endswith("__main__"))
+    names = (
+        m.name
+        for m in pkgutil.walk_packages(lv.__path__, "lavender.")
+        if not m.name.endswith("__main__")
+    )
     for name in names:
         spec = importlib.util.find_spec(name)
-        if spec.origin and spec.origin.endswith(".py") and ">>> " in Path(spec.origin).read_text(encoding="utf-8"):
+        if (
+            spec.origin
+            and spec.origin.endswith(".py")
+            and ">>> " in Path(spec.origin).read_text(encoding="utf-8")
+        ):
             yield name
 
 
@@ -76,7 +84,9 @@ def files(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if not page.stem.startswith("chapter")], ids=lambda page: page.name
+    "page",
+    [page for page in PAGES if not page.stem.startswith("chapter")],
+    ids=lambda page: page.name,
 )
 def test_python_of_a_page_runs(page, files, capsys):
     whole = "".join(text for *_, text in blocks(page, "python", "pycon"))
@@ -105,22 +115,34 @@ ITERATIONS = {
 
 
 @pytest.mark.parametrize("engine", list(ITERATIONS))
-def test_recording_of_an_engine_has_errors_that_its_iterations_remove(engine, tmp_path, monkeypatch):
+def test_recording_of_an_engine_has_errors_that_its_iterations_remove(
+    engine, tmp_path, monkeypatch
+):
     """Direction of the normal, positions, v* and position correction are right: a wrong one leaves an error."""
     pytest.importorskip(engine)
     monkeypatch.chdir(tmp_path)
-    texts = [text for *_, text in blocks(ROOT / "docs" / "engines.md", "python") if f"import {engine}\n" in text]
+    texts = [
+        text
+        for *_, text in blocks(ROOT / "docs" / "engines.md", "python")
+        if f"import {engine}\n" in text
+    ]
     assert len(texts) == 1 and f"{ITERATIONS[engine]}10" in texts[0]
     errors, left_over = [], []
     for n in (10, 500):
-        text = texts[0].replace(f"{ITERATIONS[engine]}10", f"{ITERATIONS[engine]}{n}").replace("-steps", f"-{n}")
+        text = (
+            texts[0]
+            .replace(f"{ITERATIONS[engine]}10", f"{ITERATIONS[engine]}{n}")
+            .replace("-steps", f"-{n}")
+        )
         exec(compile(text, "engines.md", "exec"), {})
         lines = (tmp_path / f"{engine.lower()}-{n}" / "engine.jsonl").read_text().splitlines()
         assert len(lines) == 30
         errors.append(np.median([json.loads(line)["velocity"] for line in lines]))
         left_over += [json.loads(line)["left_over"] for line in lines]
     assert errors[1] < 0.1 * errors[0], errors
-    assert np.median(left_over) < 1e-3 * errors[0]  # pymunk's friction exceeds the cone in few steps.
+    assert (
+        np.median(left_over) < 1e-3 * errors[0]
+    )  # pymunk's friction exceeds the cone in few steps.
 
 
 def test_the_test_of_the_page_on_plug_ins_passes_as_a_file_of_its_own(tmp_path):
@@ -128,7 +150,10 @@ def test_the_test_of_the_page_on_plug_ins_passes_as_a_file_of_its_own(tmp_path):
     (text,) = (text for text in python_blocks if "import pytest" in text and "cross_check" in text)
     path = tmp_path / "test_mine.py"
     path.write_text(text, encoding="utf-8")
-    assert "6 passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", path, cwd=tmp_path).stdout
+    assert (
+        "6 passed"
+        in python("-m", "pytest", "-q", "-p", "no:cacheprovider", path, cwd=tmp_path).stdout
+    )
 
 
 @pytest.mark.parametrize("name", list(modules_with_doctests()))
@@ -140,13 +165,20 @@ def test_doctests_of_a_module(name):
 
 def commands_of(page):
     """(where, words) of the commands of a page: lines of blocks, and code within the text without places left open."""
-    lines = [(line, text) for line, _, block in blocks(page, "sh", "console") for text in block.splitlines()]
+    lines = [
+        (line, text)
+        for line, _, block in blocks(page, "sh", "console")
+        for text in block.splitlines()
+    ]
     text = page.read_text(encoding="utf-8")
     for found in re.finditer(r"`((?:lavender|python -m benchmarks) [^`]+)`", BLOCK.sub("", text)):
         if not set("[…") & set(found[1]) and not found[1].endswith("..."):
             lines.append((0, found[1]))
     for line, command in lines:
-        yield (f"{page.name}, block at line {line}: {command}", shlex.split(command.removeprefix("$ "), comments=True))
+        yield (
+            f"{page.name}, block at line {line}: {command}",
+            shlex.split(command.removeprefix("$ "), comments=True),
+        )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -169,7 +201,9 @@ def test_command_lines_of_a_page_are_understood(page):
 
 def anchors(page):
     """Return the anchors that the headings of a page get from MyST."""
-    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
     return {
         re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
         for title in re.findall(r"^#{1,4} (.+)$", text, re.MULTILINE)
@@ -186,7 +220,9 @@ LINKED = [
 
 def links(page):
     """Return the relative targets of the links and images of a page, outside of code."""
-    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
     text = re.sub(r"`[^`\n]*`", "code", text)
     targets = re.findall(r"\]\(([^()\s]+)\)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
     return [target for target in targets if not re.match(r"[a-z]+:", target)]
@@ -199,25 +235,34 @@ def test_links_resolve_in_a_checkout(page):
         name, _, anchor = target.partition("#")
         other = (page.parent / name).resolve() if name else page
         assert other.exists() and other.is_relative_to(ROOT), f"{page.name} links to {target}"
-        assert not {"generated", "_build"} & set(other.relative_to(ROOT).parts), f"{page.name}: {target}"
+        assert not {"generated", "_build"} & set(other.relative_to(ROOT).parts), (
+            f"{page.name}: {target}"
+        )
         if anchor and "=" not in anchor:
             assert anchor in anchors(other), f"{page.name} links to {target}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_pages_install_from_the_checkout_until_a_version_is_published(page):
-    assert "No wheel has been published" in (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    assert "No wheel has been published" in (ROOT / "docs" / "install.md").read_text(
+        encoding="utf-8"
+    )
     assert not re.search(r"pip install [^`\n]*lavender-contact", page.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
 def test_pages_shown_by_a_forge_have_no_markup_of_sphinx(page):
     text = page.read_text(encoding="utf-8")
-    assert re.findall(r"^ *(?:`{3,}|:{3,}) *\{.*|^: .*|\{(?:doc|ref|numref)\}`.*", text, re.MULTILINE) == []
+    assert (
+        re.findall(r"^ *(?:`{3,}|:{3,}) *\{.*|^: .*|\{(?:doc|ref|numref)\}`.*", text, re.MULTILINE)
+        == []
+    )
 
 
 def test_the_page_on_plug_ins_shows_the_project_file_of_the_example():
-    (shown,) = re.findall(r"^   ```toml\n(.*?)^   ```$", (ROOT / "docs/plugin.md").read_text("utf-8"), re.M | re.S)
+    (shown,) = re.findall(
+        r"^   ```toml\n(.*?)^   ```$", (ROOT / "docs/plugin.md").read_text("utf-8"), re.M | re.S
+    )
     file = ROOT / "examples" / "plugin" / "pyproject.toml"
     assert textwrap.dedent(shown) == file.read_text(encoding="utf-8")
 
@@ -230,7 +275,9 @@ def test_written_pages_are_current(generate):
 
 def test_every_test_that_a_page_names_exists():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
-    known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(re.findall(r"def (test_\w+)", sources))
+    known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(
+        re.findall(r"def (test_\w+)", sources)
+    )
     for page in PAGES:
         named = set(re.findall(r"\btest_\w+", page.read_text(encoding="utf-8")))
         assert named <= known, f"{page.name} names {sorted(named - known)}"
@@ -246,14 +293,22 @@ def test_the_page_of_examples_lists_every_example():
 
 def test_the_page_on_failures_has_every_status_and_every_error():
     text = (ROOT / "docs" / "failures.md").read_text(encoding="utf-8")
-    for name in (*lv.Status.__members__, "InputError", "UnknownName", "CapabilityError", "SolverUnavailable"):
+    for name in (
+        *lv.Status.__members__,
+        "InputError",
+        "UnknownName",
+        "CapabilityError",
+        "SolverUnavailable",
+    ):
         assert f"| `{name}` |" in text
 
 
 def test_documentation_has_every_column_of_records():
     page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     table = page.partition("## The columns of records")[2].partition("\n## ")[0]
-    lines = lv.report.run(["toy_stack"], ["pgs"], lv.report.Plan(tolerances=(1e-3,), budgets=(), repeats=1))
+    lines = lv.report.run(
+        ["toy_stack"], ["pgs"], lv.report.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
+    )
     assert set(re.findall(r"`(\w+)`", table)) >= set(lv.report.select_runs(lines))
 
 
@@ -263,7 +318,9 @@ def test_readme_has_the_numbers_of_its_figure():
     curves = numbers["curves"]
     for name in ("pgs", "nncg"):
         assert min(error for _, error in curves[name]) > 1e-4
-    reached = next(point for tol, point in enumerate(curves["auto"], 1) if tol == 6)  # at tol = 1e-6
+    reached = next(
+        point for tol, point in enumerate(curves["auto"], 1) if tol == 6
+    )  # at tol = 1e-6
     newton = next(seconds for seconds, error in curves["newton"] if error <= reached[1])
     before, after = numbers["worst"].values()
     for part in (

@@ -48,7 +48,9 @@ def test_solvers_of_every_kind_agree_with_osqp():
             assert row.distance <= row.allowed
             # a backend that does not agree says that it failed, as quadprog does on a singular A
             assert row.verdict in ("agrees", "not solved"), str(table)
-            assert row.verdict == "agrees" or row.status not in ("CONVERGED", "ROUNDOFF_LIMIT"), str(table)
+            assert row.verdict == "agrees" or row.status not in ("CONVERGED", "ROUNDOFF_LIMIT"), (
+                str(table)
+            )
 
 
 def test_sweeps_with_any_order_within_a_color_have_the_same_bits():
@@ -71,7 +73,9 @@ def test_example_friction_bounds_are_met_and_right_ones_give_coulomb():
     np.testing.assert_allclose(rounds[0], rounds[-1], rtol=0.0, atol=1e-12)
     normal, tangent = rounds[-1][0::2], rounds[-1][1::2]
     assert np.all(np.abs(tangent) <= module.MU * normal + 1e-12)
-    assert abs(tangent[-1]) == pytest.approx(module.MU * normal[-1], rel=1e-9)  # the top contact slides
+    assert abs(tangent[-1]) == pytest.approx(
+        module.MU * normal[-1], rel=1e-9
+    )  # the top contact slides
     assert np.abs(found["glued"][1::2]).max() > 2 * module.MU * normal[-1]
     # tol 1e-9 relative of impulses below 1 N s, times the conditioning of six boxes (about 50).
     for name in ("osqp", "pgs"):
@@ -91,7 +95,9 @@ def test_example_residual_and_motion_error_follow_the_theory(drawn):
         # 2 sqrt(2 n) / pi for a stack without end; a finite one stays some percent below.
         assert 0.85 < factors[-1] / (2.0 * np.sqrt(2.0 * n) / np.pi) < 1.05
     hang = found["curves"]["hang(n=33, tip_mass=1e4)"]
-    assert hang[-1, 1] < 0.2 and hang[-1, 2] > 0.9  # nearly content, and the weight falls all the same
+    assert (
+        hang[-1, 1] < 0.2 and hang[-1, 2] > 0.9
+    )  # nearly content, and the weight falls all the same
     residual, error = found["gram"]
     assert residual.relative == pytest.approx(1.0)
     # Its share of the energy: sqrt(1e-3 / (3000 + 1e-3)), at equal speeds.
@@ -134,7 +140,9 @@ def test_example_drift_follows_the_motion_error(monkeypatch):
 
 
 def test_a_box_of_pinocchio_comes_to_rest_on_its_corners():
-    pytest.importorskip("pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'")
+    pytest.importorskip(
+        "pinocchio", reason="needs Pinocchio 4: pip install 'lavender-contact[pinocchio]'"
+    )
     module = example("pinocchio_box")
     heights, speeds, force, worst = module.run()
     assert worst <= 1e-8  # what was asked for
@@ -150,7 +158,9 @@ def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
     found, force = module.run()
     assert len(found) > 0.9 * module.STEPS
     theirs, apart = np.median(found[:, [0, 2]], axis=0)
-    assert found[:, 1].max() <= 1e-9 < theirs < 1e-3  # asked for; SAP's contacts are soft, and little
+    assert (
+        found[:, 1].max() <= 1e-9 < theirs < 1e-3
+    )  # asked for; SAP's contacts are soft, and little
     assert apart < 1e-5
     assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)
 
@@ -186,15 +196,22 @@ def test_the_planar_engine_holds_its_joints_and_its_circles(drawn):
     frames, speeds, residual = found["run"]
     assert residual < 1e-5 and found["drift"] < 1e-6
     assert found["depth"].max() < 0.1 * module.RADIUS and found["depth"][-1] < 0.005
-    assert np.abs(frames[-1, 1:, 0]).max() < 2.0 and np.abs(frames[-1] - frames[-2]).max() < 0.01  # in the box
-    assert speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0  # more than the motor's torque
+    assert (
+        np.abs(frames[-1, 1:, 0]).max() < 2.0 and np.abs(frames[-1] - frames[-2]).max() < 0.01
+    )  # in the box
+    assert (
+        speeds[0] == pytest.approx(module.SPEED) and speeds.min() < 0.0
+    )  # more than the motor's torque
 
 
 def test_the_planar_engine_runs_when_it_is_copied_alone(tmp_path):
     copy = tmp_path / "engine_2d.py"
     copy.write_text(example("engine_2d").__loader__.get_source("engine_2d"), encoding="utf-8")
     output = python(copy, cwd=tmp_path).stdout
-    assert "bar: 1.50 rad/s wanted" in output and "no figure: the folder examples/panels is missing" in output
+    assert (
+        "bar: 1.50 rad/s wanted" in output
+        and "no figure: the folder examples/panels is missing" in output
+    )
 
 
 def test_warm_starts_keep_their_matches_for_ten_minutes():
@@ -210,7 +227,10 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
     mujoco = pytest.importorskip("mujoco")
     module = example("compare_models")
     texts = 'frictionloss="0.2" range="-1 1" actuatorfrcrange="-30 30"', 'range="-1 1"'
-    source, other = (mujoco.MjModel.from_xml_string(module.PENDULUM.format(f'{text} limited="true"')) for text in texts)
+    source, other = (
+        mujoco.MjModel.from_xml_string(module.PENDULUM.format(f'{text} limited="true"'))
+        for text in texts
+    )
     module.compare(source, other)
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == ["hinge: friction 0.2, converted 0.0", "hinge: effort 30.0, converted inf"]

@@ -6,7 +6,12 @@ from worked import ROOT, python
 
 
 def run(*arguments, seed="0", status=0):
-    return python(ROOT / ".ci" / "fingerprint", *arguments, status=status, env={**os.environ, "PYTHONHASHSEED": seed})
+    return python(
+        ROOT / ".ci" / "fingerprint",
+        *arguments,
+        status=status,
+        env={**os.environ, "PYTHONHASHSEED": seed},
+    )
 
 
 def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path):
@@ -16,7 +21,12 @@ def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path)
     before = file.read_text()
     items = [line.split("\t")[1] for line in before.splitlines()]
     assert items[1:] == sorted(items[1:]) or items == sorted(items)
-    for word in ("problem box_stackF(n=10)", "solve box_stackF(n=10) | newton", "| random", "| colored"):
+    for word in (
+        "problem box_stackF(n=10)",
+        "solve box_stackF(n=10) | newton",
+        "| random",
+        "| colored",
+    ):
         assert any(word in item for item in items), word
     run("--only", "two_particles | pgs", "--out", file)  # Only these items of the file are written.
     assert set(before.splitlines()) < set(file.read_text().splitlines())
@@ -30,7 +40,9 @@ def test_fingerprint_is_the_same_in_another_process_and_names_a_change(tmp_path)
         named.append(f"changed  {item}: result {'0' * len(result)} -> {result}")
     lines.append("own\torder box_stackF(n=10) | none | given\t-\t-\t-\n")
     file.write_text("".join(lines))
-    other = run(*only, "--compare", file, seed="77", status=1)  # in which everything else is the same
+    other = run(
+        *only, "--compare", file, seed="77", status=1
+    )  # in which everything else is the same
     for words in (*named, "gone     order box_stackF(n=10) | none | given", " 3 changed or gone"):
         assert words in other.stdout
     machine = next(line for line in lines if line.split("\t")[1] == "machine").split("\t")[2]

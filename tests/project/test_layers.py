@@ -43,7 +43,11 @@ def find_breaches(package, text):
 def test_kernel_imports_only_packages_below_its_own():
     paths = [p for p in KERNELS.glob("*/*") if p.suffix in {".py", ".pyx", ".pxd"}]
     assert len(paths) > 100
-    assert {str(p): x for p in paths if (x := find_breaches(p.parent.name, p.read_text(encoding="utf-8")))} == {}
+    assert {
+        str(p): x
+        for p in paths
+        if (x := find_breaches(p.parent.name, p.read_text(encoding="utf-8")))
+    } == {}
 
 
 def test_readme_of_kernels_lists_packages_in_order_and_files_that_exist():
@@ -57,7 +61,9 @@ def test_readme_of_kernels_lists_packages_in_order_and_files_that_exist():
 
 
 def test_architecture_page_lists_layers_in_the_order_of_their_contract():
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "importlinter"
+    ]
     (layers,) = (c["layers"] for c in settings["contracts"] if c.get("containers") == ["lavender"])
     above = layers[layers.index("cli") : layers.index("io") + 1]
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")

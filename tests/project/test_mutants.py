@@ -31,8 +31,14 @@ def test_every_fault_applies_once_changes_its_file_and_has_a_sentence():
                 problems.append(f"{fault.name} changes nothing")
         except (OSError, ValueError) as error:
             problems.append(str(error))
-        if not (fault.sentence.endswith(".") and fault.sentence[0].isupper() and len(fault.sentence.split()) > 4):
-            problems.append(f"{fault.name}: its first line is {fault.sentence!r}; a sentence on its effect is needed")
+        if not (
+            fault.sentence.endswith(".")
+            and fault.sentence[0].isupper()
+            and len(fault.sentence.split()) > 4
+        ):
+            problems.append(
+                f"{fault.name}: its first line is {fault.sentence!r}; a sentence on its effect is needed"
+            )
     assert not problems, "\n".join(problems)
 
 
@@ -53,5 +59,7 @@ def test_recorded_results_are_of_faults_and_name_a_test_file_that_exists():
 def test_nearly_all_faults_of_kernels_can_be_switched():
     """Each other one costs a compilation of minutes."""
     kernels = [fault for fault in FAULTS if fault.is_kernel]
-    single = [f.name for f in kernels if mutants.switch_fault(f, (ROOT / f.path).read_text(), 1) is None]
+    single = [
+        f.name for f in kernels if mutants.switch_fault(f, (ROOT / f.path).read_text(), 1) is None
+    ]
     assert len(single) <= 5, single

@@ -28,14 +28,21 @@ def test_version_equals_the_installed_one_and_has_changes():
 
 
 def test_citation_file_names_this_version_and_licence():
-    said = dict(re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE))
+    said = dict(
+        re.findall(r"^([\w-]+): (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
+    )
     assert said["version"] == lavender.__version__
-    assert said["license"] == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
+    assert (
+        said["license"]
+        == tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["license"]
+    )
     assert {"cff-version", "message", "title"} <= set(said)
 
 
 def test_workflows_name_files_that_exist():
-    said = "".join(path.read_text("utf-8") for path in (ROOT / ".github" / "workflows").glob("*.yml"))
+    said = "".join(
+        path.read_text("utf-8") for path in (ROOT / ".github" / "workflows").glob("*.yml")
+    )
     named = set(re.findall(r"\.ci/[\w.]+|tests/[\w/.]+", said))
     assert ".ci/run" in named
     assert [name for name in named if not (ROOT / name).exists()] == []
@@ -51,9 +58,23 @@ def declared(table):
 def test_imports_of_the_package_are_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
     known = declared("dependencies") | declared("fclib") | declared("qp")
-    known |= declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
+    known |= (
+        declared("cluster")
+        | declared("peers")
+        | declared("mujoco")
+        | declared("torch")
+        | declared("jax")
+    )
     # If installed:
-    known |= declared("newton") | {"lavendersim", "mujoco_warp", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
+    known |= declared("newton") | {
+        "lavendersim",
+        "mujoco_warp",
+        "pinocchio",
+        "pydrake",
+        "qoco",
+        "siconos",
+        "warp",
+    }
     known |= {"genesis"}  # genesis-world, of the extra `genesis`
     known |= {"cupy"}  # imported only for a caller who gives arrays of it
     known |= {"PIL", "markupsafe"}  # which matplotlib and jinja2 require
@@ -92,8 +113,13 @@ def test_cflags_with_fast_math_keep_rounding(fast, tmp_path):
     from lavender_ext.build_options import COMPILE_FLAGS, LINK_FLAGS
 
     (tmp_path / "x.c").write_text("#ifdef __FAST_MATH__\n#error fast\n#endif\n")
-    for step in (["-c", "x.c", "-O3", *COMPILE_FLAGS], ["-###", "-shared", "x.o", "-o", "x.so", *LINK_FLAGS]):
-        done = subprocess.run(["cc", fast, *step], cwd=tmp_path, capture_output=True, text=True, check=True)
+    for step in (
+        ["-c", "x.c", "-O3", *COMPILE_FLAGS],
+        ["-###", "-shared", "x.o", "-o", "x.so", *LINK_FLAGS],
+    ):
+        done = subprocess.run(
+            ["cc", fast, *step], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
     assert "-o x.so" in done.stderr.replace('"', "")
     assert "crtfastmath" not in done.stderr
 

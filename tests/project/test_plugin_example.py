@@ -19,7 +19,9 @@ if importlib.util.find_spec("pip") is None:
     pytest.skip("pip is not installed: plug-ins are installed with it", allow_module_level=True)
 FOUND = {d.name: d.version for d in metadata.distributions(name="setuptools")}
 if int(FOUND.get("setuptools", "0").split(".")[0]) < 77:
-    pytest.skip("the plug-in is built by the setuptools that is here, 77 or newer", allow_module_level=True)
+    pytest.skip(
+        "the plug-in is built by the setuptools that is here, 77 or newer", allow_module_level=True
+    )
 
 SOLVES = """
 import sys, warnings
@@ -70,7 +72,9 @@ def test_meets_the_contract_of_every_solver(environment):
     report = python("-m", "lavender", "contract", "apgd", env=environment).stdout
     assert "NOT MET" not in report
     met, total = re.search(r"^apgd meets (\d+) of (\d+) requirements$", report, re.M).groups()
-    assert met == total and int(met) == 7  # each requirement of a resumable solver without orders and seeds
+    assert (
+        met == total and int(met) == 7
+    )  # each requirement of a resumable solver without orders and seeds
     assert "orders_change_the_sweep" in report.splitlines()[-1]
 
 
@@ -88,9 +92,20 @@ def compiled(tmp_path_factory):
         copy = clone / path.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, copy)
-    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--target", clone / "installed", source]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--target",
+        clone / "installed",
+        source,
+    ]
     done = subprocess.run(pip, capture_output=True, text=True, timeout=600)
-    missing = re.search(r"No matching distribution found for (setuptools|cython)", done.stdout + done.stderr)
+    missing = re.search(
+        r"No matching distribution found for (setuptools|cython)", done.stdout + done.stderr
+    )
     if done.returncode and missing:
         pytest.skip("no package index: setuptools and Cython of the build cannot be installed")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -143,7 +158,9 @@ def test_plugin_example_with_a_fault_fails_only_its_checks(environment, tmp_path
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[lavender.solvers]\nfaulty = faulty:SPEC\n")
     path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
-    report = python("-m", "lavender", "contract", "faulty", env={**environment, "PYTHONPATH": path}, status=1).stdout
+    report = python(
+        "-m", "lavender", "contract", "faulty", env={**environment, "PYTHONPATH": path}, status=1
+    ).stdout
     assert "np." not in report and "Traceback" not in report and "assert" not in report
     assert "CONVERGED and lv.residual(problem, impulse).relative <= 1e-08" in report
     assert "ZeroDivisionError: planted" in report

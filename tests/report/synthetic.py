@@ -58,7 +58,10 @@ def lines_of(*made, cases=None, whole=True, solvers=None, walk=False, more=()):
 
     With `walk`, all cases called walk[STEP] are steps of one sequence.
     """
-    plan = {"tolerances": list(TOLERANCES), "solvers": solvers or sorted({r["solver"] for r in made})}
+    plan = {
+        "tolerances": list(TOLERANCES),
+        "solvers": solvers or sorted({r["solver"] for r in made}),
+    }
     machine = {
         "kind": "machine",
         "run": "run",
@@ -113,11 +116,19 @@ def example(folder):
     crashed = {"status": "CRASHED (SIGSEGV)", "claims": False}
     for i, case in enumerate(("pile", EVIL)):
         size = 1e-3 * (1 + i)
-        for solver, ratio, relative in (("auto", 1.0, 1e-9), ("direct", 2.0, 1e-13), ("osqp", 3.0, 1e-8)):
+        for solver, ratio, relative in (
+            ("auto", 1.0, 1e-9),
+            ("direct", 2.0, 1e-13),
+            ("osqp", 3.0, 1e-8),
+        ):
             made.append(record(case, solver, ratio * size, relative, load=6.0))
         made.append(record(case, "pgs", size, 9e-4, tol=1e-3, iterations=40))
         made.append(record(case, "pgs", 1e-4, 1e-2, **BUDGET))
-        made.append(record(case, "liar", 0.1 * size, 0.5, message="done", worst_name="<b>row 3", **FALSE_CLAIM))
+        made.append(
+            record(
+                case, "liar", 0.1 * size, 0.5, message="done", worst_name="<b>row 3", **FALSE_CLAIM
+            )
+        )
         if case == "pile":
             made.append(record(case, "dead", 1.0, float("inf"), **{**crashed, "times": ()}))
     made.append(record("idle", "pgs", 1e-5, 1.0, velocity=3e-12))
@@ -125,10 +136,21 @@ def example(folder):
         for start, left in (("cold", 1e-1), ("carried", 1e-2)):
             steps = {"start": start, "step": step}
             made.append(record(f"walk[{step}]", "pgs", 1e-3, left, **steps, **BUDGET))
-            made.append(record(f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps))
+            made.append(
+                record(f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps)
+            )
     facts = {
-        "pile": {"source": str(folder / "pile.npz"), "stored": 1e-4, "diagnostics": ["duplicate rows: two of <3>"]},
-        EVIL: {"source": "chains/one.npz", "guess": "answer", "structure": "stack, friction", "law": "coulomb"},
+        "pile": {
+            "source": str(folder / "pile.npz"),
+            "stored": 1e-4,
+            "diagnostics": ["duplicate rows: two of <3>"],
+        },
+        EVIL: {
+            "source": "chains/one.npz",
+            "guess": "answer",
+            "structure": "stack, friction",
+            "law": "coulomb",
+        },
         "idle": {"nothing_to_do": True},
         **{f"walk[{k}]": {"structure": "chain"} for k in range(2)},
     }
@@ -148,6 +170,8 @@ def example(folder):
         "velocity": 0.1,
         "worst": "contact 2",
     }
-    (folder / "engine.jsonl").write_text(json.dumps(answer) + "\n" + json.dumps({"left_out": 1}) + "\n")
+    (folder / "engine.jsonl").write_text(
+        json.dumps(answer) + "\n" + json.dumps({"left_out": 1}) + "\n"
+    )
     old = lines_of(record("pile", "auto", 0.3e-3, 1e-9), record("pile", "pgs", 1.0, 1e-1))
     return Report(lines, old, [2e-4, 4e-3], read_engine_answers([], lines))

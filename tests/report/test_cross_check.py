@@ -17,7 +17,9 @@ from lavender.report.text import format_residual
 def bounded_problem(seed, stiff=0.3, contacts=8):
     """Joints with and without bounds, contacts without friction; every row a little compliant."""
     problem = random_contact_problem(seed, tangents=0, spin=False, contacts=contacts)
-    return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff)
+    return lv.Problem(
+        problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff
+    )
 
 
 def test_cross_check_with_a_residual_that_is_too_small_reports_a_breach():
@@ -27,13 +29,17 @@ def test_cross_check_with_a_residual_that_is_too_small_reports_a_breach():
     honest = lv.residual(problem, wrong)
     # As if the judge had lost a factor of a thousand.
     faulty = replace(honest, error=1e-3 * honest.error, relative=1e-3 * honest.relative)
-    row = check.compare_with_reference(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
+    row = check.compare_with_reference(
+        problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum
+    )
     assert row.verdict == check.BREACH
     assert row.contradicted
     fair = check.compare_with_reference(
         problem,
         "fair",
-        replace(optimum, impulse=wrong, residual=honest, claim_check="confirmed", status_conflict=""),
+        replace(
+            optimum, impulse=wrong, residual=honest, claim_check="confirmed", status_conflict=""
+        ),
         optimum,
     )
     assert fair.verdict == check.NOT_SOLVED
@@ -54,7 +60,9 @@ def test_cross_check_under_coulomb_law_or_an_asymmetric_matrix_has_no_reference(
     assert "not symmetric" in table.reference_note
     assert table["osqp"].verdict == check.REFUSED
     assert "symmetric" in table["osqp"].note
-    table = cross_check(lv.Problem.lcp([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]), ["newton"], reference="direct")
+    table = cross_check(
+        lv.Problem.lcp([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]), ["newton"], reference="direct"
+    )
     assert table.reference is None and table["newton"].verdict == check.AGREES_UNCOMPARED
     assert "not positive semidefinite" in table.reference_note
 
@@ -67,13 +75,17 @@ def test_cross_check_under_coulomb_law_refuses_a_named_reference_and_shows_veloc
     for row in table:
         assert row.distance is None and row.allowed is None
         by_row = lv.residual(coulomb, row.solution.impulse).velocity_by_row
-        by_contact = [np.linalg.norm(by_row[rows]) for _, rows in coulomb.cones.friction_components()]
+        by_contact = [
+            np.linalg.norm(by_row[rows]) for _, rows in coulomb.cones.friction_components()
+        ]
         normals_and_joints = np.delete(by_row, coulomb.cones.friction_rows)
         assert row.velocity == pytest.approx(max(*by_contact, *normals_and_joints), rel=1e-12)
         assert format_residual(row.velocity) in str(table)
     assert table["newton"].velocity < table["pgs"].velocity
     table = cross_check(coulomb, ["newton"], "newton")
-    assert table.reference is None and "newton solves it, but several motions" in table.reference_note
+    assert (
+        table.reference is None and "newton solves it, but several motions" in table.reference_note
+    )
 
 
 def test_cross_check_under_the_cone_law_uses_a_reference_of_cones():
@@ -119,7 +131,10 @@ def test_cross_check_with_a_refused_solver_lists_it_and_is_ok():
 # is 7 % off.
 KNOWN_LIARS = {"proxqp"}
 # Iterations may end at their default budget; direct methods, admm and anderson solve every case, with two exceptions.
-UNSOLVED = {("anderson", "boxed_friction(n=3, scene=granular)"), ("quadprog", "boxed_friction(n=3, scene=granular)")}
+UNSOLVED = {
+    ("anderson", "boxed_friction(n=3, scene=granular)"),
+    ("quadprog", "boxed_friction(n=3, scene=granular)"),
+}
 COMPARED = [
     c
     for c in [*suite.cases("default"), suite.case("granular(n=2, friction=cone)")]
@@ -143,7 +158,9 @@ def test_cross_check_of_suite_cases_has_a_reference_and_every_solver_agrees(case
 
 
 def test_cross_check_method_of_free_rows_runs_its_bounded_variant():
-    table = lv.cross_check(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), ["gauss_seidel", "sor", "pgs"])
+    table = lv.cross_check(
+        lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), ["gauss_seidel", "sor", "pgs"]
+    )
     row = table["gauss_seidel"]
     assert (row.solver, row.ran, row.verdict) == ("gauss_seidel", "pgs", check.AGREES)
     assert "gauss_seidel → pgs  agrees" in str(table)
@@ -158,7 +175,9 @@ def test_cross_check_method_of_free_rows_runs_its_bounded_variant():
 
 
 def test_cross_check_of_a_problem_without_solution_reports_the_proofs():
-    table = lv.cross_check(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ["direct", "lemke", "pgs"])
+    table = lv.cross_check(
+        lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), ["direct", "lemke", "pgs"]
+    )
     assert [row.verdict for row in table] == [check.PROVED, check.PROVED, check.NOT_SOLVED]
     assert table.reference is None
     assert not table.ok and not table.contradicted
@@ -186,8 +205,14 @@ def test_cross_check_idle_problem_neither_agrees_nor_fails():
 
 def test_cross_check_of_answers_at_their_floor_reports_no_breach():
     for seed in range(8):
-        for problem in (lv.Problem.lcp(*spd(8, seed=seed)), random_lcp(seed), random_lcp(seed, rank=6)):
-            check = lv.cross_check(problem, ["newton", "direct", "pgs"], reference="newton", tol=1e-15)
+        for problem in (
+            lv.Problem.lcp(*spd(8, seed=seed)),
+            random_lcp(seed),
+            random_lcp(seed, rank=6),
+        ):
+            check = lv.cross_check(
+                problem, ["newton", "direct", "pgs"], reference="newton", tol=1e-15
+            )
             assert check.contradicted == (), str(check)
 
 

@@ -25,7 +25,9 @@ def control(n=5, dt=0.1, singular=False):
     """A program of predictive control: n steps of a double integrator with bounds on speed and force."""
     step = np.array([[1.0, dt], [0.0, 1.0]])
     force = np.array([[dt * dt / 2.0], [dt]])
-    weight = sp.block_diag([sp.kron(sp.eye(n), np.diag([10.0, 0.0 if singular else 1.0])), 0.1 * sp.eye(n)])
+    weight = sp.block_diag(
+        [sp.kron(sp.eye(n), np.diag([10.0, 0.0 if singular else 1.0])), 0.1 * sp.eye(n)]
+    )
     A = sp.hstack([sp.kron(sp.eye(n, k=-1), step) - sp.eye(2 * n), sp.kron(sp.eye(n), force)])
     b = np.zeros(2 * n)
     b[:2] = -step @ [1.0, -0.5]
@@ -34,9 +36,14 @@ def control(n=5, dt=0.1, singular=False):
 
 
 @pytest.mark.parametrize("singular", [False, True])
-def test_run_of_a_program_file_times_solve_qp_and_has_the_error_of_the_program(tmp_path, singular, monkeypatch):
+def test_run_of_a_program_file_times_solve_qp_and_has_the_error_of_the_program(
+    tmp_path, singular, monkeypatch
+):
     arrays = control(singular=singular)
-    np.savez(tmp_path / "control.npz", **{k: x.toarray() if sp.issparse(x) else x for k, x in arrays.items()})
+    np.savez(
+        tmp_path / "control.npz",
+        **{k: x.toarray() if sp.issparse(x) else x for k, x in arrays.items()},
+    )
     calls = []
     real = case_kinds.solve_qp
 
@@ -74,7 +81,11 @@ def test_printed_call_of_a_program_has_the_limit_of_iterations_that_it_needs():
 def test_report_of_programs_has_its_figure_in_errors_of_the_program(tmp_path):
     lines = report.run([lv.Problem.from_qp(**control(), name="control")], ["auto", "osqp"], PLAN)
     page = report.write(lines, tmp_path / "out").read_text()
-    assert "lv.solve_qp(problem, " in page and "15 variables, 40 rows" in page and "error of the program" in page
+    assert (
+        "lv.solve_qp(problem, " in page
+        and "15 variables, 40 rows" in page
+        and "error of the program" in page
+    )
     assert "m/s" not in page.partition("<details>")[0] and "nan" not in page.lower()
 
 
@@ -97,8 +108,12 @@ def test_cross_check_of_a_program_compares_errors_and_distances(singular):
     for row in (row for row in found if row.verdict != "refused"):
         assert row.verdict == "agrees" and row.relative <= 1e-7 and row.distance <= row.allowed
         assert row.relative == row.solution.program_error and abs(row.objective) < 1e-5
-        x, best = (problem.qp.recover_variables(s.impulse) for s in (row.solution, found["osqp"].solution))
-        assert row.distance == pytest.approx(np.sqrt((x - best) @ (control(singular=singular)["P"] @ (x - best))))
+        x, best = (
+            problem.qp.recover_variables(s.impulse) for s in (row.solution, found["osqp"].solution)
+        )
+        assert row.distance == pytest.approx(
+            np.sqrt((x - best) @ (control(singular=singular)["P"] @ (x - best)))
+        )
     assert "[√cost]" in str(found) and "m/s" not in str(found)
 
 
@@ -115,7 +130,11 @@ def test_bound_of_a_distance_holds_for_any_two_points(seed):
         for _ in range(2):
             lam = qp.select_row_multipliers(best.impulse) + size * rng.normal(size=len(qp.target))
             lam[qp.free :] = np.maximum(lam[qp.free :], 0.0)
-            impulse = np.append(best.x + size * rng.normal(size=len(best.x)), lam) if qp.is_singular else lam
+            impulse = (
+                np.append(best.x + size * rng.normal(size=len(best.x)), lam)
+                if qp.is_singular
+                else lam
+            )
             points.append(dataclasses.replace(best.solution, impulse=impulse))
         distance, allowed = case.compute_separation(*points)
         assert 0.0 < distance <= allowed
@@ -123,7 +142,9 @@ def test_bound_of_a_distance_holds_for_any_two_points(seed):
 
 def test_cross_check_names_programs_without_a_solution():
     infeasible = lv.Problem.from_qp(np.eye(1), [0.0], G=[[1.0], [-1.0]], h=[-1.0, -1.0])
-    assert {row.verdict for row in cross_check(infeasible, ["auto", "osqp"])} == {"no solution, proved"}
+    assert {row.verdict for row in cross_check(infeasible, ["auto", "osqp"])} == {
+        "no solution, proved"
+    }
     unbounded = lv.Problem.from_qp(np.zeros((1, 1)), [1.0], ub=[0.0])
     assert {row.verdict for row in cross_check(unbounded, ["auto", "osqp"])} == {UNBOUNDED}
 

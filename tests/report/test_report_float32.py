@@ -48,7 +48,9 @@ def test_read_engine_answers_with_a_stored_impulse_judges_it(tmp_path):
     for i in range(2):
         p.save(tmp_path / f"step_{i}.npz", impulse=early)
     # Two steps have an impulse, the others only a line, the last one without a residual.
-    lines = [{"file": f"step_{i}.npz", "rows": 2, "seconds": 1e-5, "solver": "PGS"} for i in range(4)]
+    lines = [
+        {"file": f"step_{i}.npz", "rows": 2, "seconds": 1e-5, "solver": "PGS"} for i in range(4)
+    ]
     lines[1] |= {"relative": 1e-12, "velocity": 0.0, "verdict": "at its floor"}
     lines[2] |= {"relative": 1e-3, "verdict": "wrong"}
     (tmp_path / "engine.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n[1]\ntorn")
@@ -58,6 +60,10 @@ def test_read_engine_answers_with_a_stored_impulse_judges_it(tmp_path):
     assert engine["velocity"].tolist()[:2] == [judged.velocity] * 2 and judged.velocity > 0.1
     assert engine["verdict"].isin(["stopped before convergence", "wrong"]).all()
     (tmp_path / "engine.jsonl").unlink()
-    (first, second) = (describe_case(item, "run") for item in resolve_sources([tmp_path], sequences=True))
+    (first, second) = (
+        describe_case(item, "run") for item in resolve_sources([tmp_path], sequences=True)
+    )
     engine = read_engine_answers([], make_lines([first, second]))
-    assert engine["relative"].tolist() == [judged.relative] * 2 and set(engine["solver"]) == {"engine"}
+    assert engine["relative"].tolist() == [judged.relative] * 2 and set(engine["solver"]) == {
+        "engine"
+    }

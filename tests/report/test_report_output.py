@@ -83,8 +83,13 @@ def test_texts_of_a_report_with_every_part_are_approved(written):
         "terminal": shown(report, 120, complete=True),
         "terminal, short": shown(report, 80),
         "summary.md": (out / "summary.md").read_text(encoding="utf-8"),
-        "words of the page": "\n".join(Reader((out / "index.html").read_text(encoding="utf-8")).words),
-        **{path.name: path.read_text(encoding="utf-8") for path in sorted((out / "tables").iterdir())},
+        "words of the page": "\n".join(
+            Reader((out / "index.html").read_text(encoding="utf-8")).words
+        ),
+        **{
+            path.name: path.read_text(encoding="utf-8")
+            for path in sorted((out / "tables").iterdir())
+        },
     }
     for name, text in texts.items():
         check_text("report.txt", name, text.replace(str(out.parent), "FOLDER"))
@@ -92,10 +97,20 @@ def test_texts_of_a_report_with_every_part_are_approved(written):
 
 def test_report_write_has_files_of_every_table_figure_and_run(written):
     report, out, events = written
-    assert {p.name for p in out.iterdir()} == {"records.csv", "index.html", "summary.md", "figures", "tables"}
+    assert {p.name for p in out.iterdir()} == {
+        "records.csv",
+        "index.html",
+        "summary.md",
+        "figures",
+        "tables",
+    }
     assert {p.stem for p in (out / "tables").glob("*.csv")} == {*report.sections, "matrix"}
-    kinds = {kind: {p.stem for p in (out / "figures").glob(f"*.{kind}")} for kind in drawing.FILE_KINDS}
-    assert all(names == {"time-to-accuracy", "profile", "error-against-time"} for names in kinds.values())
+    kinds = {
+        kind: {p.stem for p in (out / "figures").glob(f"*.{kind}")} for kind in drawing.FILE_KINDS
+    }
+    assert all(
+        names == {"time-to-accuracy", "profile", "error-against-time"} for names in kinds.values()
+    )
     for figure in (out / "figures").glob("*.svg"):
         root = ElementTree.parse(figure).getroot()
         assert root.tag.endswith("svg")
@@ -108,13 +123,18 @@ def test_report_write_has_files_of_every_table_figure_and_run(written):
     latex = (out / "tables" / "solvers.tex").read_text(encoding="utf-8")
     assert r"\toprule" in latex and "nan" not in latex.lower()
     assert EVIL not in (out / "summary.md").read_text(encoding="utf-8")
-    assert {e.phase for e in events} == {"writing"} and [e.done for e in events] == list(range(events[0].total))
+    assert {e.phase for e in events} == {"writing"} and [e.done for e in events] == list(
+        range(events[0].total)
+    )
 
 
 def test_entry_of_bibtex_agrees_with_the_citation_file(written):
     root = Path(__file__).resolve().parents[2]
     lines = (root / "CITATION.cff").read_text(encoding="utf-8").splitlines()
-    title, author = (next(x.split(key)[1].strip(' "') for x in lines if key in x) for key in ("title:", "- name:"))
+    title, author = (
+        next(x.split(key)[1].strip(' "') for x in lines if key in x)
+        for key in ("title:", "- name:")
+    )
     entry = (written[1] / "tables" / "lavender.bib").read_text(encoding="utf-8")
     assert f"title = {{{{{title}}}}}" in entry and f"author = {{{{{author}}}}}" in entry
     assert "version = {0.1}, year = {2026}" in entry
@@ -125,12 +145,29 @@ def test_no_cell_of_a_report_says_nan_or_inf(tmp_path):
     made = []
     for i in range(45):
         made.append(record(f"case {i}", "auto", 1e-3, 1e-9))
-        made.append(record(f"case {i}", "dead", 1.0, float("inf"), status="ERROR", velocity=float("nan"), times=()))
+        made.append(
+            record(
+                f"case {i}",
+                "dead",
+                1.0,
+                float("inf"),
+                status="ERROR",
+                velocity=float("nan"),
+                times=(),
+            )
+        )
         made.append(record(f"case {i}", "slow", 1.0, 0.5))
     report = report_of(*made)
     write(report, tmp_path, figures=False)
-    files = [p.read_text(encoding="utf-8") for p in (tmp_path / "index.html", tmp_path / "tables" / "solvers.tex")]
-    for text in (*files, shown(report, complete=True), (tmp_path / "summary.md").read_text(encoding="utf-8")):
+    files = [
+        p.read_text(encoding="utf-8")
+        for p in (tmp_path / "index.html", tmp_path / "tables" / "solvers.tex")
+    ]
+    for text in (
+        *files,
+        shown(report, complete=True),
+        (tmp_path / "summary.md").read_text(encoding="utf-8"),
+    ):
         assert not re.search(r"(?i)(?<![a-z-])(nan|inf)(?![a-z])", text)
     csv = pd.read_csv(tmp_path / "tables" / "runs.csv", keep_default_na=False).to_numpy().ravel()
     assert "nan" not in set(map(str, csv))
@@ -142,10 +179,15 @@ def test_terminal_short_report_of_any_size_has_the_answer_first_and_ten_solvers(
     names = [f"case {i} of a folder with a long name" for i in range(cases)]
     for name in names:
         for j in range(14):
-            more = {**FALSE_CLAIM, "status_conflict": "says CONVERGED " * 9} if j > 5 else {"load": 9.0}
+            more = (
+                {**FALSE_CLAIM, "status_conflict": "says CONVERGED " * 9}
+                if j > 5
+                else {"load": 9.0}
+            )
             made.append(record(name, f"solver_{j}", 1e-3 * (1 + j), 1e-7, **more))
     facts = {
-        name: {"structure": f"structure {i}", "diagnostics": ["something looks wrong"]} for i, name in enumerate(names)
+        name: {"structure": f"structure {i}", "diagnostics": ["something looks wrong"]}
+        for i, name in enumerate(names)
     }
     skips = [skip(name, "newton", "takes laws linear") for name in names]
     skips += [skip(name + "b", "", "did not load: " + "x" * 100) for name in names]
@@ -153,14 +195,18 @@ def test_terminal_short_report_of_any_size_has_the_answer_first_and_ten_solvers(
     assert max(map(len, lines)) <= width and lines[0].startswith("Use solver_0")
     assert sum(bool(re.match(r"solver_\d+ +\d", line)) for line in lines) == 10
     text = "\n".join(lines)
-    assert all(word in text for word in ("false claim, the", "left out", "suspicious", "machine was busy"))
+    assert all(
+        word in text for word in ("false claim, the", "left out", "suspicious", "machine was busy")
+    )
 
 
 def test_write_files_has_frames_as_csv_and_data_as_json(tmp_path):
     frame = pd.DataFrame({"a": ["<x>"], "time [s]": [2e-3]})
     write_files(tmp_path, {"numbers.json": {"n": 1}, "tables/errors.csv": frame, "a.txt": "text"})
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "tables" / "errors.csv"), frame)
-    assert (tmp_path / "numbers.json").read_text() == '{\n "n": 1\n}\n' and (tmp_path / "a.txt").read_text() == "text"
+    assert (tmp_path / "numbers.json").read_text() == '{\n "n": 1\n}\n' and (
+        tmp_path / "a.txt"
+    ).read_text() == "text"
 
 
 def test_profile_is_the_share_of_cases_within_a_factor_of_the_fastest():
@@ -194,7 +240,9 @@ def test_strip_of_errors_names_each_colour_once_and_shows_the_limit(close):
     assert [above, far] == orange and below not in orange and empty == [0.0] * 4
 
 
-@pytest.mark.parametrize(("width", "head"), [(19, ["iterations,", "cold"]), (16, ["iteratio", "ns, cold"])])
+@pytest.mark.parametrize(
+    ("width", "head"), [(19, ["iterations,", "cold"]), (16, ["iteratio", "ns, cold"])]
+)
 def test_head_of_a_table_folds_between_words_if_the_table_fits(width, head):
     console = Console(width=width, record=True)
     print_table(console, pd.DataFrame({"solver": ["pgs"], "iterations, cold": [8]}))

@@ -20,7 +20,9 @@ DEAD = {"status": "ERROR", "claims": False}
 
 def all_of(cases, *solvers, relative=1e-8, **more):
     """A run of each solver (name, time) on each case."""
-    return [record(case, solver, time, relative, **more) for case in cases for solver, time in solvers]
+    return [
+        record(case, solver, time, relative, **more) for case in cases for solver, time in solvers
+    ]
 
 
 def repeated(made, *factors):
@@ -29,13 +31,20 @@ def repeated(made, *factors):
 
 
 def step_of(step, solver, relative, **more):
-    return record(f"walk[{step}]", solver, 1e-3, relative, **{"step": step, "start": "carried", **more})
+    return record(
+        f"walk[{step}]", solver, 1e-3, relative, **{"step": step, "start": "carried", **more}
+    )
 
 
 def sweeps(*given):
     """Three steps swept n times: the first has no step before it, the second is harder than the third."""
     return [
-        step_of(i, solver, 10.0 * v, **BUDGET | {"max_iter": n, "start": start, "velocity": v, "motion_error": 2.0 * v})
+        step_of(
+            i,
+            solver,
+            10.0 * v,
+            **BUDGET | {"max_iter": n, "start": start, "velocity": v, "motion_error": 2.0 * v},
+        )
         for start, n, solver, hardest in given
         for i, v in enumerate((1.0, hardest, 1e-5))
     ]
@@ -59,7 +68,10 @@ CRASHED = [
     *all_of("ab", ("mine", 0.0), relative=math.inf, message="ValueError", **DEAD),
     record("b", "yours", 0.0, math.inf, message="TypeError: of yours", **DEAD),
 ]
-STOPPED = [*(step_of(i, "auto", 1e-8) for i in range(4)), *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(4))]
+STOPPED = [
+    *(step_of(i, "auto", 1e-8) for i in range(4)),
+    *(step_of(i, "pgs", 0.5, **BUDGET) for i in range(4)),
+]
 ENGINE = all_of("a", ("auto", 4e-5), ("pgs", 5e-4)) + all_of("b", ("auto", 8e-5), ("pgs", 1e-3))
 #: Name, runs, arguments of the report, and tables that are shown below the recommendation.
 SCENARIOS = [
@@ -85,7 +97,12 @@ SCENARIOS = [
         {},
         "rank solvers runs",
     ),
-    ("7 % within the noise of 8 % is a tie with auto first", repeated(NOISY, 1.0, 1.04, 1.08), {}, "rank"),
+    (
+        "7 % within the noise of 8 % is a tie with auto first",
+        repeated(NOISY, 1.0, 1.04, 1.08),
+        {},
+        "rank",
+    ),
     ("7 % above the noise of 4 % is no tie", NOISY, {}, "rank"),
     (
         "7 % within the noise of the slower solver alone is a tie",
@@ -95,7 +112,11 @@ SCENARIOS = [
     ),
     (
         "another solver of fewer cases changes no mean",
-        [record("a", "pgs", 1e-3, 1e-8), record("b", "pgs", 1e-2, 1e-8), record("a", "slow", 1.9, 1e-8)],
+        [
+            record("a", "pgs", 1e-3, 1e-8),
+            record("b", "pgs", 1e-2, 1e-8),
+            record("a", "slow", 1.9, 1e-8),
+        ],
         {},
         "rank",
     ),
@@ -113,13 +134,19 @@ SCENARIOS = [
     ),
     (
         "two of three cases are solved by three solvers, of which two are equally fast",
-        [*all_of("ab", ("newton", 1.0), ("auto", 1.001), ("pgs", 3.0)), record("c", "pgs", 1.0, 0.5)],
+        [
+            *all_of("ab", ("newton", 1.0), ("auto", 1.001), ("pgs", 3.0)),
+            record("c", "pgs", 1.0, 0.5),
+        ],
         {},
         "structures solvers",
     ),
     (
         "times are rows to the power 1.5; three cases are too few for a fit",
-        [*(record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in SIZES.items()), *all_of(list(SIZES)[:3], ("few", 1e-6))],
+        [
+            *(record(c, "pgs", 1e-6 * n**1.5, 1e-8) for c, n in SIZES.items()),
+            *all_of(list(SIZES)[:3], ("few", 1e-6)),
+        ],
         {"cases": {c: {"rows": n} for c, n in SIZES.items()}},
         "costs",
     ),
@@ -151,14 +178,22 @@ SCENARIOS = [
     ("the carried start halves the time", carried(), {"walk": True}, "sequences"),
     (
         "8 carried or 16 cold sweeps keep 1 mm/s; acceleration is only in the table",
-        [*sweeps(*SWEEPS, ("carried", 2, "anderson", 1e-6)), sweeps(("carried", 2, "sequential_impulses", 1e-6))[1]],
+        [
+            *sweeps(*SWEEPS, ("carried", 2, "anderson", 1e-6)),
+            sweeps(("carried", 2, "sequential_impulses", 1e-6))[1],
+        ],
         {"walk": True},
         "sweeps",
     ),
     (
         "the engine's own 8 iterations leave 2.5 mm/s",
         sweeps(*SWEEPS),
-        {"walk": True, "answers": {"walk[1]": {"relative": 0.1, "velocity": 2.5e-3, "iterations": 8, "solver": "PGS"}}},
+        {
+            "walk": True,
+            "answers": {
+                "walk[1]": {"relative": 0.1, "velocity": 2.5e-3, "iterations": 8, "solver": "PGS"}
+            },
+        },
         "",
     ),
     ("no measured number of sweeps keeps 1 mm/s", sweeps(SWEEPS[0], SWEEPS[3]), {"walk": True}, ""),
@@ -225,7 +260,12 @@ SCENARIOS = [
         {},
         "",
     ),
-    ("plug-ins have their place", all_of("a", ("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3)), {}, ""),
+    (
+        "plug-ins have their place",
+        all_of("a", ("auto", 1e-3), ("mine", 2e-3), ("other", 3e-3)),
+        {},
+        "",
+    ),
     (
         "three solvers within 3 % and one at 20 %",
         all_of("a", ("pgs", 1e-3), ("auto", 1.03e-3), ("direct", 1.2e-3)),
@@ -256,7 +296,11 @@ SCENARIOS = [
     (
         "an engine that answered one of two problems is not ranked",
         ENGINE,
-        {"answers": {"a": {"solver": "NEWTON", "verdict": "wrong", "seconds": 1e-5, "relative": 1e-9}}},
+        {
+            "answers": {
+                "a": {"solver": "NEWTON", "verdict": "wrong", "seconds": 1e-5, "relative": 1e-9}
+            }
+        },
         "rank",
     ),
     *(
@@ -281,20 +325,38 @@ def describe_report(report, tables_shown):
     """The sentences of a report, and its tables with numbers of six digits."""
     parts = [report.verdict, *report.alarms, *report.sentences, *report.warnings, *report.code]
     for name in tables_shown.split():
-        frame = tables.rank_solvers(report, 1e-6) if name == "rank" else getattr(tables, f"tabulate_{name}")(report)
-        parts += [f"{name}:", frame.to_csv(index=name == "rank", float_format="%.6g", lineterminator="\n").rstrip()]
+        frame = (
+            tables.rank_solvers(report, 1e-6)
+            if name == "rank"
+            else getattr(tables, f"tabulate_{name}")(report)
+        )
+        parts += [
+            f"{name}:",
+            frame.to_csv(index=name == "rank", float_format="%.6g", lineterminator="\n").rstrip(),
+        ]
     return "\n".join(parts)
 
 
-@pytest.mark.parametrize(("name", "made", "more", "tables_shown"), SCENARIOS, ids=[name for name, *_ in SCENARIOS])
-def test_report_has_its_approved_recommendation_and_tables(tmp_path, name, made, more, tables_shown):
+@pytest.mark.parametrize(
+    ("name", "made", "more", "tables_shown"), SCENARIOS, ids=[name for name, *_ in SCENARIOS]
+)
+def test_report_has_its_approved_recommendation_and_tables(
+    tmp_path, name, made, more, tables_shown
+):
     more = dict(more)
-    old, times, answers = (more.pop(key, default) for key, default in (("old", None), ("times", []), ("answers", {})))
+    old, times, answers = (
+        more.pop(key, default) for key, default in (("old", None), ("times", []), ("answers", {}))
+    )
     if answers:  # of an engine, to the case of the same name
         folder = tmp_path / "steps"
         folder.mkdir()
-        answer_lines = [json.dumps({"file": f"{case}.npz", "rows": 3, **answer}) for case, answer in answers.items()]
-        (folder / "engine.jsonl").write_text("\n".join(2 * answer_lines))  # of an engine that ran twice
+        answer_lines = [
+            json.dumps({"file": f"{case}.npz", "rows": 3, **answer})
+            for case, answer in answers.items()
+        ]
+        (folder / "engine.jsonl").write_text(
+            "\n".join(2 * answer_lines)
+        )  # of an engine that ran twice
         more["cases"] = {case: {"source": str(folder / f"{case}.npz")} for case in answers}
     lines = lines_of(*made, **more)
     report = Report(lines, old, times, read_engine_answers([], lines))
@@ -302,19 +364,31 @@ def test_report_has_its_approved_recommendation_and_tables(tmp_path, name, made,
 
 
 def test_report_without_times_ranks_by_solved_cases_and_shows_no_time():
-    made = [*all_of("abc", ("auto", 0.0)), *all_of("ab", ("pgs", 0.0)), record("c", "pgs", 0.0, 0.5)]
+    made = [
+        *all_of("abc", ("auto", 0.0)),
+        *all_of("ab", ("pgs", 0.0)),
+        record("c", "pgs", 0.0, 0.5),
+    ]
     lines = lines_of(*made)
     lines.at[0, "plan"]["campaign"] = True
     report = Report(lines)
     assert report.verdict == "Use auto: it solves all 3 problems to 10⁻⁶ (no times were measured)."
     page = report.make_page().render()
-    assert "µs" not in page.replace("10\u00a0µs", "").replace("10 µs", "") and "<svg" not in page and "✓" in page
+    assert (
+        "µs" not in page.replace("10\u00a0µs", "").replace("10 µs", "")
+        and "<svg" not in page
+        and "✓" in page
+    )
     assert "[s]" not in ",".join(report.sections["solvers"].frame)
 
 
 def test_rank_solvers_counts_unsolved_and_refused_cases_as_the_time_limit():
     """Geometric mean, shifted by 10 µs, of 1 ms and the limit of 2 s."""
-    made = [*all_of("ab", ("all", 4e-2)), *all_of("a", ("some", 1e-3), ("few", 1e-3)), record("b", "some", 1.0, 0.5)]
+    made = [
+        *all_of("ab", ("all", 4e-2)),
+        *all_of("a", ("some", 1e-3), ("few", 1e-3)),
+        record("b", "some", 1.0, 0.5),
+    ]
     ranking = tables.rank_solvers(report_of(*made), 1e-6)
     expected = math.sqrt((1e-3 + 1e-5) * (2.0 + 1e-5)) - 1e-5
     assert ranking.loc[["some", "few"], "mean"].to_numpy() == pytest.approx(expected)
@@ -364,7 +438,10 @@ def test_format_cells_times_have_one_unit_and_sizes_one_format():
         ["b", "–", "4", "5.0e-1", "3", "3.1 %"],
     ]
     assert list_number_heads(texts) == set(texts) - {"solver"}
-    assert list(format_cells(pd.DataFrame({"n": ["x", "y"], "t [s]": [2e-6, 3e-6]}))) == ["n", "t [µs]"]
+    assert list(format_cells(pd.DataFrame({"n": ["x", "y"], "t [s]": [2e-6, 3e-6]}))) == [
+        "n",
+        "t [µs]",
+    ]
     sizes = format_cells(pd.DataFrame({"a [-]": [0.35, 0.2], "b [m/s]": [2.9e-3, math.nan]}))
     assert sizes.to_numpy().tolist() == [["3.5e-1", "2.9e-3"], ["2.0e-1", "–"]]
     markdown = format_markdown(pd.DataFrame({"a": ["<b>|*x*"]}))

@@ -15,13 +15,24 @@ from worked import python
 import lavender as lv
 from lavender import report, suite
 from lavender.report import case_kinds, cases, machine, runner, store, timing, workers
-from lavender.report.store import KEY, RUN_COLUMNS, make_lines, select_cases, select_runs, select_skips
+from lavender.report.store import (
+    KEY,
+    RUN_COLUMNS,
+    make_lines,
+    select_cases,
+    select_runs,
+    select_skips,
+)
 from lavender.report.sweeps import SweepStudy
 from lavender.report.timing import format_call
 
 QUICK = report.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0)
 SEEDED = [f"granular(n=2, seed={i})" for i in range(40)]
-NAMES = [*(f"random_spd(n=12, condition=100, seed={i})" for i in range(3)), *SEEDED[:3], "toy_stack"]
+NAMES = [
+    *(f"random_spd(n=12, condition=100, seed={i})" for i in range(3)),
+    *SEEDED[:3],
+    "toy_stack",
+]
 CAMPAIGN = report.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8))
 
 
@@ -59,10 +70,16 @@ def test_run_records_have_the_judged_result_of_each_target_and_its_times():
     for r in found:
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter)
         error = again.residual
-        assert (r.relative, r.error_energy, r.velocity) == (error.relative, error.energy, error.velocity)
+        assert (r.relative, r.error_energy, r.velocity) == (
+            error.relative,
+            error.energy,
+            error.velocity,
+        )
         found = r.status, r.worst_row, json.loads(r.work)
         assert found == (again.status.name, error.worst_row, dict(again.work))
-        assert r.success == (r.mode == "tol") and 1 <= r.repetitions <= (1 if r.mode == "budget" else 2)
+        assert r.success == (r.mode == "tol") and 1 <= r.repetitions <= (
+            1 if r.mode == "budget" else 2
+        )
         assert 0.0 < r.time <= r.time_median and r.setup_time + r.solve_time > 0.0
         assert (r.structure, r.islands, r.rows) == ("stack", 1, 12)
 
@@ -87,7 +104,9 @@ def test_run_timed_call_is_the_printed_line(monkeypatch):
         del calls[: r.repetitions - 1]  # Only the first call of a task has a time limit.
         solver, asked, guess = calls.pop(0)
         exec("\n".join(format_call(r, True)[:-1]), names)
-        line = eval(format_call(r, True)[-1].replace("lv.solve(problem, ", "dict(solver="), {"dict": dict})
+        line = eval(
+            format_call(r, True)[-1].replace("lv.solve(problem, ", "dict(solver="), {"dict": dict}
+        )
         assert (solver, asked["tol"]) == (line["solver"], line["tol"])
         assert asked["max_iter"] == line.get("max_iter", 10_000_000)
         assert (guess is None) == (names["problem"].guess is None) == (r.start == "cold")
@@ -102,16 +121,24 @@ def test_run_answer_as_guess_is_not_a_start(tmp_path):
         p.updated(guess=guess).save(tmp_path / "step.npz", impulse=guess if early else None)
         lines = report.run([tmp_path / "step.npz"], ["pgs"], QUICK)
         found = rows_of(lines)
-        assert {r.start for r in found} == {"cold"} and select_cases(lines).loc["step", "guess"] == "answer"
+        assert {r.start for r in found} == {"cold"} and select_cases(lines).loc[
+            "step", "guess"
+        ] == "answer"
         assert all(r.iterations > 5 for r in found if r.mode == "tol" and r.tol == 1e-8)
     warm = report.run([p.updated(guess=0.99 * answer)], ["pgs"], QUICK)
     assert {r.start for r in rows_of(warm)} == {"cold", "warm"}
 
 
 def test_run_exact_solvers_run_once_and_hopeless_tolerances_are_left_out():
-    assert [(r.tol, r.success) for r in rows_of(report.run([stack(8)], ["direct"], QUICK))] == [(1e-8, True)]
-    impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible")
-    assert [r.tol for r in rows_of(report.run([impossible], ["pgs"], QUICK)) if r.mode == "tol"] == [1e-3]
+    assert [(r.tol, r.success) for r in rows_of(report.run([stack(8)], ["direct"], QUICK))] == [
+        (1e-8, True)
+    ]
+    impossible = lv.Problem.lcp(
+        np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible"
+    )
+    assert [
+        r.tol for r in rows_of(report.run([impossible], ["pgs"], QUICK)) if r.mode == "tol"
+    ] == [1e-3]
 
 
 def test_run_solver_that_raises_costs_its_own_record(plug_in):
@@ -124,22 +151,32 @@ def test_run_solver_that_raises_costs_its_own_record(plug_in):
 
     plug_in(fail, "fake_raise"), plug_in(lose, "fake_nan")
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "fake_lie")
-    found = report.run([stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK)
+    found = report.run(
+        [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
+    )
     found = rows_of(found)
     by = {(r.case, r.solver): r for r in found}
     for case in ("one", "two"):
         failed = by[case, "fake_raise"]
         assert (failed.status, failed.message) == ("ERROR", "RuntimeError: of the backend")
-        assert (by[case, "fake_nan"].status, by[case, "fake_nan"].relative) == ("NUMERICAL_ERROR", 1.0)
+        assert (by[case, "fake_nan"].status, by[case, "fake_nan"].relative) == (
+            "NUMERICAL_ERROR",
+            1.0,
+        )
         assert by[case, "fake_lie"].claim_check == "contradicted"
         assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
-    assert sum(r.solver == "fake_raise" for r in found) == 2  # After it, no tolerance can be reached.
+    assert (
+        sum(r.solver == "fake_raise" for r in found) == 2
+    )  # After it, no tolerance can be reached.
 
 
 def test_run_solver_of_free_rows_is_replaced_by_its_bounded_variant():
     free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
     found = report.run([stack(4), free], ["gauss_seidel"], QUICK)
-    assert {(r.case, r.solver) for r in rows_of(found)} == {("stack", "pgs"), ("free", "gauss_seidel")}
+    assert {(r.case, r.solver) for r in rows_of(found)} == {
+        ("stack", "pgs"),
+        ("free", "gauss_seidel"),
+    }
     (reason,) = select_skips(found)["reason"]
     assert reason.startswith("gauss_seidel → pgs: takes laws linear, not 'lcp'")
     both = report.run([stack(4)], ["gauss_seidel", "pgs"], QUICK)  # measured once if both are named
@@ -169,16 +206,24 @@ def test_store_has_each_row_when_it_is_made(tmp_path):
 
     def watch(event):
         if event.row is not None:
-            seen.append(json.loads(path.read_text().splitlines()[-1]) == store.to_jsonable(event.row))
+            seen.append(
+                json.loads(path.read_text().splitlines()[-1]) == store.to_jsonable(event.row)
+            )
 
-    found = report.run([stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch)
+    found = report.run(
+        [stack(6)], ["pgs", "direct"], dataclasses.replace(QUICK, repeats=1), path, watch=watch
+    )
     assert seen == [True] * len(rows_of(found)) and texts(report.read(path)) == texts(found)
     # Files of an editor that marks UTF-8, put together: the mark is before each part.
     path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
     assert texts(report.read(path)) == texts(found)
 
 
-SEQUENCE = (report.make_sequence(moving_stack(5), "load"), ["pgs"], report.Plan((), budgets=(6,), repeats=1))
+SEQUENCE = (
+    report.make_sequence(moving_stack(5), "load"),
+    ["pgs"],
+    report.Plan((), budgets=(6,), repeats=1),
+)
 SOME = (NAMES[3:], ["pgs", "gauss_seidel"], report.CampaignPlan(tolerances=(1e-3,), budgets=(4,)))
 
 
@@ -212,9 +257,15 @@ def test_run_killed_at_any_byte_continues(given, first, later, tmp_path):
         kept = len(rows_of(read))
         again, more = measure(later)
         assert keys_of(again) == keys_of(whole) and skipped(again) == skipped(whole)
-        assert kept + more >= len(rows_of(whole)) == len(rows_of(report.read(path))) and more <= made
+        assert (
+            kept + more >= len(rows_of(whole)) == len(rows_of(report.read(path))) and more <= made
+        )
     again, more = measure(later)
-    assert keys_of(again) == keys_of(whole) and len(rows_of(report.read(path))) == len(rows_of(whole)) and more == 0
+    assert (
+        keys_of(again) == keys_of(whole)
+        and len(rows_of(report.read(path))) == len(rows_of(whole))
+        and more == 0
+    )
 
 
 def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
@@ -225,7 +276,11 @@ def test_run_other_version_or_cpu_is_another_run(tmp_path, monkeypatch):
         monkeypatch.setattr(machine, name, value)
         ids |= {r.run for r in rows_of(report.run([stack(5)], ["direct"], QUICK, path))}
     found = report.Report(report.read(path))
-    assert len(ids) == 3 and len(found.runs) == 3 * len(rows_of(first)) and len(found.newest) == len(rows_of(first))
+    assert (
+        len(ids) == 3
+        and len(found.runs) == 3 * len(rows_of(first))
+        and len(found.newest) == len(rows_of(first))
+    )
 
 
 def test_run_ctrl_c_keeps_the_records_that_were_made(tmp_path, plug_in):
@@ -250,10 +305,16 @@ def test_write_csv_has_a_row_for_each_run(tmp_path):
     with (tmp_path / "records.csv").open(newline="") as f:
         rows = list(csv.DictReader(f))
     for row, r in zip(rows, rows_of(found), strict=True):
-        assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (r.relative, r.time, machine.get_cpu_name())
+        assert (float(row["relative"]), float(row["time"]), row["cpu"]) == (
+            r.relative,
+            r.time,
+            machine.get_cpu_name(),
+        )
         assert json.loads(row["work"]) == json.loads(r.work) and int(row["rows"]) == r.rows > 0
     assert f"numpy {np.__version__}" in rows[0]["versions"]
-    with pytest.raises(lv.InputError, match="no records of solver 'nncg'; there are records of direct, pgs"):
+    with pytest.raises(
+        lv.InputError, match="no records of solver 'nncg'; there are records of direct, pgs"
+    ):
         store.select_solvers(found, ["nncg"])
 
 
@@ -273,7 +334,12 @@ def test_read_infinite_and_undefined_numbers_are_kept_to_the_last_bit(tmp_path):
             opened.add(entry)
     (back,) = rows_of(report.read(tmp_path))
     assert back.relative == math.inf and math.isnan(back.time) and math.isnan(back.roundoff_floor)
-    assert (back.message, back.tol, back.max_iter, back.worst_name) == ("é\n", 0.1 + 0.2, 10_000_000, "a\n")
+    assert (back.message, back.tol, back.max_iter, back.worst_name) == (
+        "é\n",
+        0.1 + 0.2,
+        10_000_000,
+        "a\n",
+    )
 
 
 def test_run_marks_impulses_that_gain_energy():
@@ -287,9 +353,17 @@ def test_run_marks_impulses_that_gain_energy():
     # 1e-9 is far above the rounding of energies of a few joules.
     expected = problem.energy_change(answer) - answer @ target
     assert by["warm", "budget"].energy_gain == pytest.approx(expected, abs=1e-9) and expected > 0.01
-    assert by["cold", "budget"].energy_gain == by["cold", "tol"].energy_gain == by["warm", "tol"].energy_gain == 0.0
+    assert (
+        by["cold", "budget"].energy_gain
+        == by["cold", "tol"].energy_gain
+        == by["warm", "tol"].energy_gain
+        == 0.0
+    )
     (warning,) = (text for text in report.Report(lines).warnings if text.startswith("gains energy"))
-    assert warning == f"gains energy: pgs in 1 run, at most {expected:.2g} J ({by['warm', 'budget'].case})"
+    assert (
+        warning
+        == f"gains energy: pgs in 1 run, at most {expected:.2g} J ({by['warm', 'budget'].case})"
+    )
     driven = lv.Problem.from_jacobian(
         np.eye(2), np.eye(2), [-1.0, -1.0], cones=lv.Cones.bounded([0.5, 0.0], [9.0, 9.0])
     )
@@ -327,7 +401,9 @@ def record_warm_engine(folder, sweeps, first=30, steps=90):
     errors = []
     with lv.io.Recorder(folder, every=1, solver="own loop") as recorder:
         for step in range(steps):
-            moved = dataclasses.replace(rows, v_free=velocity + rows.v_free)  # rows.v_free is that of gravity alone.
+            moved = dataclasses.replace(
+                rows, v_free=velocity + rows.v_free
+            )  # rows.v_free is that of gravity alone.
             problem = lv.Problem.from_rows(moved, mu=0.5, key=np.arange(rows.n_contacts))
             start = None if last is None else problem.carry(last)
             last = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=sweeps, impulse=start)
@@ -345,7 +421,9 @@ def test_run_recording_from_step_30_of_a_warm_engine_has_its_error_in_the_table(
     lines = report.run(cases.resolve_sources([str(tmp_path)]), ["sequential_impulses"], plan)
     study = SweepStudy(report.Report(lines))
     # The report starts the second step from the engine's answer to the first; the sweeps are the same.
-    assert study.errors.loc["sequential_impulses", sweeps] == pytest.approx(max(errors[1:]), rel=1e-6)
+    assert study.errors.loc["sequential_impulses", sweeps] == pytest.approx(
+        max(errors[1:]), rel=1e-6
+    )
     assert study.cold.loc["sequential_impulses", sweeps] > 2.0 * max(errors[1:])
 
 
@@ -380,7 +458,9 @@ def test_campaign_one_worker_and_two_give_equal_bits_and_no_times(tmp_path):
     assert texts(one) == texts(two) and skipped(one) == skipped(two)
     assert select_cases(one).equals(select_cases(two))
     found = rows_of(one)
-    assert all(r.repetitions == 0 and math.isnan(r.time) and math.isnan(r.setup_time) for r in found)
+    assert all(
+        r.repetitions == 0 and math.isnan(r.time) and math.isnan(r.setup_time) for r in found
+    )
     (r,) = (r for r in found if (r.case, r.solver, r.max_iter) == (NAMES[0], "pgs", 8))
     again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=8)
     assert again.residual.relative == r.relative
@@ -396,7 +476,9 @@ def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path,
     p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
     lv.io.save(p, tmp_path / "file.npz")
     (tmp_path / "bad.npz").write_bytes(b"broken")
-    found = report.run([p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["direct"], short, workers=2)
+    found = report.run(
+        [p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["direct"], short, workers=2
+    )
     assert [(r.case, r.success) for r in rows_of(found)] == [("mine", True), ("file", True)]
     assert ["did not load" in reason for reason in select_skips(found)["reason"]] == [True]
     for name in ("here_alone", "pgs"):  # also under the name of a solver of lavender
@@ -415,11 +497,15 @@ def test_campaign_problems_files_and_local_solvers_are_sent_to_workers(tmp_path,
         ("dask", "distributed", r"pip install 'lavender-contact\[cluster\]'"),
     ],
 )
-def test_campaign_backend_that_cannot_be_used_is_an_input_error(backend, missing, message, monkeypatch):
+def test_campaign_backend_that_cannot_be_used_is_an_input_error(
+    backend, missing, message, monkeypatch
+):
     if missing:
         monkeypatch.setitem(sys.modules, missing, None)
     elif backend.startswith("dask"):
-        pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
+        pytest.importorskip(
+            "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
+        )
         monkeypatch.setattr(workers, "CONNECT_TIMEOUT", 0.2)
     with pytest.raises(lv.InputError, match=message):
         report.run(NAMES[:1], ["pgs"], CAMPAIGN, backend=backend)
@@ -445,7 +531,9 @@ def make_pile_among_separate_rows():
 def make_driven_chain(n=6):
     """Bars in a plane; each joint has a hinge, a limit and a motor."""
     position = np.column_stack([np.arange(n) + 0.5, np.zeros(n)])
-    builder = lv.RowBuilder(np.ones(n), np.full(n, 3.0), np.tile([0.0, -0.1, 0.0], (n, 1)), 1 / 60, position)
+    builder = lv.RowBuilder(
+        np.ones(n), np.full(n, 3.0), np.tile([0.0, -0.1, 0.0], (n, 1)), 1 / 60, position
+    )
     for i in range(n):
         builder.hinge(i - 1, i, (float(i), 0.0))
         builder.limit(i - 1, i, value=0.0, lower=-1.0, upper=1.0)
@@ -466,8 +554,14 @@ def make_driven_chain(n=6):
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
         (lv.Problem.from_rows(two_bodies(3)), ("stack", "redundant")),
         (lv.Problem.from_rows(two_bodies(1), mu=0.5, tangents=2), ("stack", "friction")),
-        (lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)), ("separate", "redundant")),
-        (lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)), ("separate", "asymmetric")),
+        (
+            lv.Problem.lcp(lv.Problem.from_rows(two_bodies(3)).dense(), np.zeros(6)),
+            ("separate", "redundant"),
+        ),
+        (
+            lv.Problem.linear(np.array([[2.0, 0.01], [0.0, 2.0]]), np.ones(2)),
+            ("separate", "asymmetric"),
+        ),
         (lv.Problem.linear(np.array([[2.0, 0.5], [0.0, 2.0]]), np.ones(2)), ("asymmetric",)),
         (lv.Problem.contact(np.eye(9), np.ones(9), np.full(3, 0.5)), ("separate", "friction")),
         (make_pile_among_separate_rows(), ("pile",)),
@@ -497,7 +591,9 @@ def test_hash_problem_changes_with_every_number():
     variants.append(dataclasses.replace(variants[-1], precision="float32"))
     variants += [dataclasses.replace(p, key=np.arange(5, dtype=np.uint64) + k) for k in (0, 1)]
     hashes = [cases.hash_problem(v) for v in variants]
-    assert len(set(hashes)) == len(variants) and cases.hash_problem(stack(5, "renamed")) == hashes[0]
+    assert (
+        len(set(hashes)) == len(variants) and cases.hash_problem(stack(5, "renamed")) == hashes[0]
+    )
 
 
 def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(tmp_path):
@@ -507,7 +603,9 @@ def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(t
         for i in (1, 2):
             lv.io.save(p, tmp_path / folder / f"scene-{i:06d}.npz")
     lv.io.save(p, tmp_path / "mixed" / "other.npz")
-    items = report.resolve_sources([tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"])
+    items = report.resolve_sources(
+        [tmp_path / "a" / "steps", tmp_path / "b" / "steps", tmp_path / "mixed"]
+    )
     assert [(i.sequence, i.step) for i in items] == [
         ("steps", 0),
         ("steps", 1),
@@ -517,9 +615,15 @@ def test_resolve_sources_recorded_steps_are_sequences_and_folders_are_searched(t
         ("", -1),
         ("", -1),
     ]
-    assert all(i.sequence == "" for i in report.resolve_sources([tmp_path / "a" / "steps"], sequences=False))
+    assert all(
+        i.sequence == ""
+        for i in report.resolve_sources([tmp_path / "a" / "steps"], sequences=False)
+    )
     alike = report.resolve_sources([tmp_path / "a" / name for name in ("my steps", "My_steps")])
-    assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}  # Figures are files named after sequences.
+    assert {i.sequence for i in alike} == {
+        "my steps",
+        "a/My_steps",
+    }  # Figures are files named after sequences.
     (tmp_path / "mixed" / "back").symlink_to(tmp_path / "mixed")  # is not read again
     assert len(report.resolve_sources([tmp_path / "mixed", "stack(n=2)"])) == 4
     with pytest.raises(lv.InputError, match="no such"):
@@ -534,7 +638,10 @@ def test_resolve_sources_files_of_one_name_are_named_after_the_folders_that_diff
     names = [item.name for item in report.resolve_sources([*files, "stack(n=2)"])]
     assert names == ["a/step_01", "b/worst/step_01", "c/worst/step_01", "stack(n=2)"]
     lv.io.save(stack(4), tmp_path / "step_01.npz")
-    names = [item.name for item in report.resolve_sources([tmp_path / "step_01.npz", *files[:1], *files[:1]])]
+    names = [
+        item.name
+        for item in report.resolve_sources([tmp_path / "step_01.npz", *files[:1], *files[:1]])
+    ]
     assert names == ["step_01", "a/step_01", "a/step_01 #2"]
 
 
@@ -553,14 +660,22 @@ def test_list_steps_are_in_numeric_order(tmp_path):
         lv.io.save(stack(4), tmp_path / f"step_{i}.npz")
     steps = cases.list_steps_in_folder(tmp_path)
     assert [item.source.rpartition("_")[2] for item in steps] == ["1.npz", "9.npz", "10.npz"]
-    assert [i.sequence for i in report.resolve_sources([tmp_path])] == ["", "", ""]  # No blocks are named.
+    assert [i.sequence for i in report.resolve_sources([tmp_path])] == [
+        "",
+        "",
+        "",
+    ]  # No blocks are named.
 
 
 def test_records_of_a_plug_in_with_changed_code_are_measured_again(tmp_path, monkeypatch, register):
     path = tmp_path / "edited_solver.py"
     path.write_text("from lavender.solvers.pgs import ProjectedGaussSeidel as Edited\n")
     monkeypatch.syspath_prepend(tmp_path)
-    register(lv.SolverSpec("edited", "edited_solver:Edited", laws=("lcp",), summary="of a test", max_iter=200))
+    register(
+        lv.SolverSpec(
+            "edited", "edited_solver:Edited", laws=("lcp",), summary="of a test", max_iter=200
+        )
+    )
     before = machine.hash_solver_sources()
     assert machine.hash_solver_sources() == before
     path.write_text(path.read_text() + "# changed\n")

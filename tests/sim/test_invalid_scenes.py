@@ -21,10 +21,14 @@ def trajectory(sim, steps):
     return [sim.step()[0]["positions"].tobytes() for _ in range(steps)]
 
 
-real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from([s * x for x in SPECIAL for s in (1.0, -1.0)])
+real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from(
+    [s * x for x in SPECIAL for s in (1.0, -1.0)]
+)
 positive = real.map(lambda x: abs(x) or 1.0)
 size = st.sampled_from((0.0, 1e-60, 1e-12, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e8, 1e30, 1e60))
-vector = st.lists(real, min_size=3, max_size=3) | st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3)
+vector = st.lists(real, min_size=3, max_size=3) | st.lists(
+    st.floats(-4.0, 4.0), min_size=3, max_size=3
+)
 GALLERY = {
     "stack": {"n": 3},
     "pyramid": {"base": 3},
@@ -83,10 +87,24 @@ JOINT_OPTIONS = {
     "damping": st.sampled_from((0.0, 1.0, 1e60)),
 }
 MOTOR = {"motor_speed": real, "motor_torque": st.sampled_from((0.0, 1.0, 1e9, 1e60))}
-SHAPES = {"body": {}, "sphere": {"radius": positive}, "box": {"size": st.lists(positive, min_size=3, max_size=3)}}
+SHAPES = {
+    "body": {},
+    "sphere": {"radius": positive},
+    "box": {"size": st.lists(positive, min_size=3, max_size=3)},
+}
 UNCHANGING = ("save", "problem", "residual")  # Actions that change nothing.
 ACTIONS = st.sampled_from(
-    (*UNCHANGING, "few sweeps", "many sweeps", "cold", "warm", "snapshot", "restore", "reset", "seed")
+    (
+        *UNCHANGING,
+        "few sweeps",
+        "many sweeps",
+        "cold",
+        "warm",
+        "snapshot",
+        "restore",
+        "reset",
+        "seed",
+    )
 )
 
 
@@ -101,7 +119,9 @@ def bodies(draw):
         options = MOTION if shape == "body" else {k: x for k, x in MOTION.items() if k != "inertia"}
         return st.fixed_dictionaries(fields | SHAPES[shape], optional=options)
 
-    return planes + draw(st.lists(st.sampled_from(sorted(SHAPES)).flatmap(body), min_size=1, max_size=8))
+    return planes + draw(
+        st.lists(st.sampled_from(sorted(SHAPES)).flatmap(body), min_size=1, max_size=8)
+    )
 
 
 def joints(n):
@@ -113,7 +133,9 @@ def joints(n):
         ("distance", {"anchor_a": vector}, {"length": size}),
     )
     strategies = (
-        st.fixed_dictionaries({"kind": st.just(kind)} | ends | fields, optional=JOINT_OPTIONS | options)
+        st.fixed_dictionaries(
+            {"kind": st.just(kind)} | ends | fields, optional=JOINT_OPTIONS | options
+        )
         for kind, fields, options in kinds
     )
     return st.lists(st.one_of(*strategies), max_size=3)
@@ -131,7 +153,9 @@ def scenes(draw):
         data["bodies"] = draw(bodies())
         data["joints"] = draw(joints(len(data["bodies"])))
     steps = st.integers(1, 10 if "solver" in parameters else 20)
-    return data | {"actions": draw(st.lists(st.one_of(steps, steps, ACTIONS), min_size=1, max_size=8))}
+    return data | {
+        "actions": draw(st.lists(st.one_of(steps, steps, ACTIONS), min_size=1, max_size=8))
+    }
 
 
 def build_scene(data):
@@ -213,7 +237,9 @@ def play(data, path, inspect=True):
 @pytest.mark.fuzz
 @pytest.mark.filterwarnings("error")
 @given(data=scenes())
-def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(data, tmp_path_factory):
+def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(
+    data, tmp_path_factory
+):
     path = tmp_path_factory.getbasetemp() / "drawn.state"
     try:
         seen = play(data, path)
@@ -224,7 +250,12 @@ def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(
 
 
 def box(size, x=0.0, y=0.0, z=0.0, **more):
-    return {"add": "box", "size": [size] * 3 if np.isscalar(size) else size, "mass": 1.0, "position": [x, y, z]} | more
+    return {
+        "add": "box",
+        "size": [size] * 3 if np.isscalar(size) else size,
+        "mass": 1.0,
+        "position": [x, y, z],
+    } | more
 
 
 def sphere(radius, x=0.0, z=0.0):
@@ -239,7 +270,12 @@ PLANE = {"add": "plane"}
 ON_BOX = [PLANE, box(1.0, z=0.5)]
 #: Scenes from which nothing may be lost in 240 steps.
 LASTING = {
-    "on one place": [*[box(1.0)] * 5, *[sphere(0.5, 3.0)] * 3, sphere(0.5), {"add": "plane", "offset": 0.3}],
+    "on one place": [
+        *[box(1.0)] * 5,
+        *[sphere(0.5, 3.0)] * 3,
+        sphere(0.5),
+        {"add": "plane", "offset": 0.3},
+    ],
     "flat boxes": [
         PLANE,
         *(
@@ -251,7 +287,10 @@ LASTING = {
             )
         ),
     ],
-    **{f"sizes of {x:g}": [*ON_BOX, sphere(0.5 * x, z=1.0 + 0.5 * x), box(x, 0.2, z=1.0 + x)] for x in (1e-6, 1e6)},
+    **{
+        f"sizes of {x:g}": [*ON_BOX, sphere(0.5 * x, z=1.0 + 0.5 * x), box(x, 0.2, z=1.0 + x)]
+        for x in (1e-6, 1e6)
+    },
     **{f"masses of {x:g}": [*ON_BOX, box(1.0, z=1.5, mass=x)] for x in (1e-6, 1e6)},
 }
 
@@ -259,13 +298,19 @@ LASTING = {
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", LASTING)
 def test_scenes_of_unlike_sizes_and_masses_lose_no_body(name, tmp_path):
-    play({"parameters": {}, "bodies": LASTING[name], "actions": [240], "lasts": True}, tmp_path / "state")
+    play(
+        {"parameters": {}, "bodies": LASTING[name], "actions": [240], "lasts": True},
+        tmp_path / "state",
+    )
 
 
 NUMBERS = {
     "real": st.sampled_from((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9)),
     "keys": st.integers(0, 2**64 - 1),
-    **dict.fromkeys(("size", "index"), st.sampled_from((-(2**31), -1000, -1, 0, 1, 2, 7, 65536, 10**8, 2**31 - 1))),
+    **dict.fromkeys(
+        ("size", "index"),
+        st.sampled_from((-(2**31), -1000, -1, 0, 1, 2, 7, 65536, 10**8, 2**31 - 1)),
+    ),
 }
 
 
@@ -310,7 +355,9 @@ def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
         state = sim.state.copy()
         state.a[name].reshape(-1).view(np.uint8)[0] ^= 1
         shot = sim.snapshot()
-        bad = lv.Snapshot(shot.fingerprint, 5, 0, "", state.size, state.real, state.index, state.keys)
+        bad = lv.Snapshot(
+            shot.fingerprint, 5, 0, "", state.size, state.real, state.index, state.keys
+        )
         before = sim.snapshot()
         with pytest.raises(lv.InputError, match=f"damaged: {name} "):
             sim.restore(bad)

@@ -25,7 +25,11 @@ def test_auto_history_has_all_stages_and_changes_no_bit(name):
     plain = lv.solve(problem)
     history = recorded.history
     assert recorded.impulse.tobytes() == plain.impulse.tobytes()
-    assert (recorded.status, recorded.iterations, recorded.message) == (plain.status, plain.iterations, plain.message)
+    assert (recorded.status, recorded.iterations, recorded.message) == (
+        plain.status,
+        plain.iterations,
+        plain.message,
+    )
     assert set(history.solvers) == CASES[name]
     assert len(history.solvers) == len(history.iterations) == len(history.time)
     assert history.iterations[0] == 0 and history.iterations[-1] == recorded.iterations

@@ -90,7 +90,14 @@ def test_auto_is_on_average_as_good_as_the_best_sweeps_of_the_same_number(clock,
             play(patch, clock, 1.0, problem)
             for sweeps in (30, 100):
                 found = []
-                for solver in ("auto", "pgs", "sequential_impulses", "block_gauss_seidel", "nncg", "anderson"):
+                for solver in (
+                    "auto",
+                    "pgs",
+                    "sequential_impulses",
+                    "block_gauss_seidel",
+                    "nncg",
+                    "anderson",
+                ):
                     clock.now = 0.0
                     limit = 1e-9 * sweeps * problem.metric.work
                     solution = lv.solve(fresh(problem), solver, tol=1e-9, time_limit=limit)
@@ -100,7 +107,9 @@ def test_auto_is_on_average_as_good_as_the_best_sweeps_of_the_same_number(clock,
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_auto_does_not_end_worse_than_the_zero_impulse_on_an_asymmetric_matrix(seed, clock, monkeypatch):
+def test_auto_does_not_end_worse_than_the_zero_impulse_on_an_asymmetric_matrix(
+    seed, clock, monkeypatch
+):
     rng = np.random.default_rng([8, seed])
     m = int(rng.integers(70, 120))
     A = rng.normal(size=(m, m)) * rng.choice([0.1, 0.5, 1.0, 2.0]) / np.sqrt(m)

@@ -15,7 +15,9 @@ def test_redundant_contacts_in_the_form_that_suits_them(name, mass_ratio):
     # Singular A, and at 1e4 ill-conditioned: the velocity form is definite, so quadprog takes it too.
     problem = suite.box_stack(10, mass_ratio).problem
     solution = lv.solve(problem, name)
-    assert solution.solver.form == ("velocity" if mass_ratio > 1.0 or name in DEFINITE else "impulse")
+    assert solution.solver.form == (
+        "velocity" if mass_ratio > 1.0 or name in DEFINITE else "impulse"
+    )
     assert solution.success, str(solution)
     # The boxes come to rest: A is singular, so the velocities are what is unique.
     speed = np.abs(problem.velocity(solution.impulse)).max()
@@ -52,7 +54,9 @@ def test_backend_that_exceeds_its_limit_is_ended(clock):
     assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
 
 
-@pytest.mark.parametrize("name", installed("osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone"))
+@pytest.mark.parametrize(
+    "name", installed("osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone")
+)
 def test_backend_receives_the_iteration_budget(name):
     problem = suite.box_stack(10, 1e4).problem
     solution = lv.solve(problem, name, max_iter=2, form="impulse")

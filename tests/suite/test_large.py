@@ -35,22 +35,31 @@ def compute_residual(problem, impulse):
     """
     rows = problem.rows
     count, bodies = len(rows.normal), len(rows.inv_mass)
-    axes = np.stack([rows.normal, rows.tangent, np.cross(rows.normal, rows.tangent)], 1)  # (c, 3, 3)
+    axes = np.stack(
+        [rows.normal, rows.tangent, np.cross(rows.normal, rows.tangent)], 1
+    )  # (c, 3, 3)
     inverse = np.zeros((bodies, 6, 6))
     inverse[:, [0, 1, 2], [0, 1, 2]] = rows.inv_mass[:, None]
     inverse[:, 3:, 3:] = rows.inv_inertia
     sides = []  # of each contact: body, Jacobian (c, 3, 6) with respect to its velocity
-    for sign, arm, body in ((-1, rows.arm_a, rows.contact_body[:, 0]), (1, rows.arm_b, rows.contact_body[:, 1])):
+    for sign, arm, body in (
+        (-1, rows.arm_a, rows.contact_body[:, 0]),
+        (1, rows.arm_b, rows.contact_body[:, 1]),
+    ):
         jac = sign * np.concatenate([axes, np.cross(arm[:, None], axes)], 2)
         sides.append((np.maximum(body, 0), jac * (body >= 0)[:, None, None]))
-    diagonal = sum(np.einsum("cri,cij,crj->cr", jac, inverse[body], jac) for body, jac in sides)  # (c, 3)
+    diagonal = sum(
+        np.einsum("cri,cij,crj->cr", jac, inverse[body], jac) for body, jac in sides
+    )  # (c, 3)
     diagonal[:, 1:] = diagonal[:, 1:].mean(1, keepdims=True)
 
     moving = rows.inv_mass > 0
     a, b = rows.contact_body.T
     both = (a >= 0) & (b >= 0) & moving[a] & moving[b]
     links = sparse.coo_matrix((np.ones(both.sum()), (a[both], b[both])), shape=(bodies, bodies))
-    island = sparse.csgraph.connected_components(links, directed=False)[1][np.where((a >= 0) & moving[a], a, b)]
+    island = sparse.csgraph.connected_components(links, directed=False)[1][
+        np.where((a >= 0) & moving[a], a, b)
+    ]
 
     def compute_norms(lam):
         change = np.zeros((bodies, 6))
@@ -85,7 +94,9 @@ def test_large_set_has_about_3000_or_20000_rows_under_coulomb_law():
         assert 2_900 <= case.problem.m <= 3_300 or 18_000 <= case.problem.m <= 22_000, case.name
 
 
-@pytest.mark.parametrize("name", [*SOLVED, *(pytest.param(name, marks=pytest.mark.nightly) for name in SOLVED_NIGHTLY)])
+@pytest.mark.parametrize(
+    "name", [*SOLVED, *(pytest.param(name, marks=pytest.mark.nightly) for name in SOLVED_NIGHTLY)]
+)
 def test_auto_on_large_case_meets_tolerance_by_second_residual(name):
     problem = suite.case(name).problem
     solution = lv.solve(problem, "auto", tol=TOL)
@@ -102,4 +113,6 @@ def test_judge_of_unconverged_large_case_equals_second_residual(name):
     solution = lv.solve(problem, "anderson", tol=0, max_iter=20)
     assert solution.residual.relative > TOL
     # Sums of 20,000 rounded squares
-    assert compute_residual(problem, solution.impulse) == pytest.approx(solution.residual.relative, rel=1e-10)
+    assert compute_residual(problem, solution.impulse) == pytest.approx(
+        solution.residual.relative, rel=1e-10
+    )

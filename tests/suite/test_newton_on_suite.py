@@ -135,7 +135,9 @@ def test_newton_claims_of_a_symmetric_matrix_and_a_slightly_asymmetric_one_are_t
     convex = lv.solve(problem.relaxed("cone"), "newton", tol=1e-8).impulse
     for given_problem in (symmetric, asymmetric):
         claim, impulse = run_newton_claim(given_problem, budget=60, impulse=convex)
-        assert (claim.status is Status.CONVERGED) == (lv.residual(given_problem, impulse).relative <= 1e-6), claim
+        assert (claim.status is Status.CONVERGED) == (
+            lv.residual(given_problem, impulse).relative <= 1e-6
+        ), claim
         assert claim.status is Status.CONVERGED or given_problem is asymmetric
 
 

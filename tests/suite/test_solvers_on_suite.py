@@ -10,7 +10,10 @@ def test_anderson_step_that_raises_the_residual_is_undone():
     problem = lv.suite.case("box_stackF(n=6, sliding=0.5)").problem
     solution = lv.solve(problem, "anderson", tol=0.0, max_iter=400)
     assert solution.work["restarts"] > 0
-    assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
+    assert (
+        solution.residual.relative
+        < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
+    )
 
 
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "nncg", "anderson"])
@@ -23,4 +26,8 @@ def test_sweeps_end_soon_after_the_tolerance_is_met(name, tol):
     solution = lv.solve(problem, name, tol=tol)
     # The last check before the end was at most an eighth, or one, or half of what was expected, too early; with
     # acceleration the fall is not steady, and the expectation may be out by as much again.
-    assert there <= solution.iterations <= there + max(1, there >> (3 if name in ("pgs", "sequential_impulses") else 2))
+    assert (
+        there
+        <= solution.iterations
+        <= there + max(1, there >> (3 if name in ("pgs", "sequential_impulses") else 2))
+    )

@@ -17,8 +17,20 @@ ROWS = 150  # at most: the set of all tests here takes seconds
 
 def recorded():
     """Steps of the engine with their warm start."""
-    scenes = [("stack", {}), ("stack", {"n": 10}), ("pyramid", {"base": 3}), ("card_house", {}), ("bridge", {})]
-    scenes += [("chain", {"n": 8}), ("heavy_on_light", {}), ("table", {"legs": 4}), ("four_bar", {}), ("ramp", {})]
+    scenes = [
+        ("stack", {}),
+        ("stack", {"n": 10}),
+        ("pyramid", {"base": 3}),
+        ("card_house", {}),
+        ("bridge", {}),
+    ]
+    scenes += [
+        ("chain", {"n": 8}),
+        ("heavy_on_light", {}),
+        ("table", {"legs": 4}),
+        ("four_bar", {}),
+        ("ramp", {}),
+    ]
     for name, parameters in scenes:
         simulation = lv.Simulation(lv.Scene(name, **parameters))
         for step in range(100):
@@ -73,7 +85,13 @@ RESTS = [
     (
         "infeasible(kind=squeeze)",
         {},
-        {"pgs": 88, "sequential_impulses": 88, "block_gauss_seidel": 88, "nncg": 517, "anderson": 922},
+        {
+            "pgs": 88,
+            "sequential_impulses": 88,
+            "block_gauss_seidel": 88,
+            "nncg": 517,
+            "anderson": 922,
+        },
     ),
     (
         "infeasible(kind=joints)",

@@ -38,7 +38,10 @@ def test_suite_function_and_case_name_make_the_same_problem():
     case = suite.pyramid(4, mass_ratio=1e6, friction="coulomb", sliding=0.5)
     assert case.name == "pyramidF(k=4, mass_ratio=1e6, sliding=0.5)"
     assert suite.case(case.name).problem == case.problem
-    assert suite.case("pyramid(k=4, friction=coulomb, sliding=.5, mass_ratio=1_000_000)").name == case.name
+    assert (
+        suite.case("pyramid(k=4, friction=coulomb, sliding=.5, mass_ratio=1_000_000)").name
+        == case.name
+    )
     assert suite.case("pyramid(friction='cone', k=2)").name == "pyramid(k=2, friction=cone)"
     assert suite.case("stack(n=1e1)").name == "stack(n=10)"
     assert suite.case("two_particles").name == "two_particles"
@@ -50,7 +53,11 @@ def test_suite_function_and_case_name_make_the_same_problem():
 
 
 def test_sets_and_families_are_listed():
-    assert [c.name for c in suite.cases("default")] == [c.name for c in suite.default()] == list(DEFAULT)
+    assert (
+        [c.name for c in suite.cases("default")]
+        == [c.name for c in suite.default()]
+        == list(DEFAULT)
+    )
     assert [c.name for c in suite.cases("stack(n=3)")] == ["stack(n=3)"]
     listed = suite.families()
     assert all(summary.strip() for summary in listed.values())
@@ -73,7 +80,11 @@ def test_sets_and_families_are_listed():
             for v in (0.01, 6)
             for law in ("coulomb", "cone")
         ),
-        *(f"anisotropic(ratio={ratio}, speed={v})" for ratio in (0.1, 100, 1e6) for v in (0.1, 100)),
+        *(
+            f"anisotropic(ratio={ratio}, speed={v})"
+            for ratio in (0.1, 100, 1e6)
+            for v in (0.1, 100)
+        ),
     ],
 )
 def test_suite_reference_is_a_solution(name):
@@ -103,7 +114,9 @@ def test_toy_stack_has_the_solution_of_enumeration():
     for lam, _ in found:
         np.testing.assert_allclose(suite.toy_stack().reference.impulse, lam, rtol=0, atol=1e-14)
     clamped = np.maximum(np.linalg.solve(problem.dense(), problem.b), 0.0)
-    assert lv.residual(problem, clamped).relative > 0.1  # solving, then clamping once, is another answer
+    assert (
+        lv.residual(problem, clamped).relative > 0.1
+    )  # solving, then clamping once, is another answer
 
 
 def test_random_spd_has_the_condition_it_names():
@@ -142,7 +155,9 @@ def test_stored_solution_meets_every_condition_to_its_digits(name):
     # Unique impulses have 31 digits. Equations of dependent rows, with rounded data, hold only to rounding.
     unit = Fraction(1, 10**30) if stored["compare"] == "impulse" else Fraction(1, 2**49)
     tolerance = unit * Fraction(float(size.max() + np.abs(problem.b).max()))
-    excess = float(tolerance) if stored["compare"] == "slack" else 0.0  # of bounds, by dependent rows
+    excess = (
+        float(tolerance) if stored["compare"] == "slack" else 0.0
+    )  # of bounds, by dependent rows
     c = problem.cones
     lower, upper = c.lower.tolist(), c.upper.tolist()
     for i in np.flatnonzero(c.kind != lv.cones.ROW):
@@ -153,7 +168,9 @@ def test_stored_solution_meets_every_condition_to_its_digits(name):
         lower[first] = 0.0
         upper[first] = np.inf
         lower[first + 1 : end] = [-np.inf] * (end - first - 1)  # nothing slides: w is 0 on all rows
-    for low, high, impulse, slack in zip(lower, upper, lam, np.array(speed, object) - np.array(b, object), strict=True):
+    for low, high, impulse, slack in zip(
+        lower, upper, lam, np.array(speed, object) - np.array(b, object), strict=True
+    ):
         assert low - excess <= float(impulse) <= high + excess
         assert slack >= -tolerance or float(impulse) >= high
         assert slack <= tolerance or float(impulse) <= low

@@ -13,13 +13,21 @@ def test_hard_set_uses_every_family():
     assert suite.SETS["hard"] == hard.SET
     assert len(set(hard.SET)) == len(hard.SET)
     names = {suite.parse_case_name(name)[0] for name in hard.SET}
-    families = {name for name, family in suite.FAMILIES.items() if family.make.__module__ == hard.__name__}
+    families = {
+        name for name, family in suite.FAMILIES.items() if family.make.__module__ == hard.__name__
+    }
     assert len(families) >= 12 and families <= names
 
 
 @pytest.mark.parametrize(
     ("name", "rank"),
-    [("duplicated(k=64)", 1), ("slab(n=10)", 3), ("slabF(n=2)", 6), ("four_bar", 17), ("ring(n=8)", 27)],
+    [
+        ("duplicated(k=64)", 1),
+        ("slab(n=10)", 3),
+        ("slabF(n=2)", 6),
+        ("four_bar", 17),
+        ("ring(n=8)", 27),
+    ],
 )
 def test_hard_problems_have_their_documented_rank(name, rank):
     problem = suite.case(name).problem
@@ -42,7 +50,9 @@ def test_hard_set_threshold_is_between_stick_and_slip():
     for above in (-1e-9, 1e-9):
         case = threshold(above=above)
         w = case.problem.slack(case.reference.impulse)
-        assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL_SPEED, abs=1e-17)
+        assert np.hypot(w[1], w[2]) == pytest.approx(
+            max(0.0, above) * 0.5 * build.FALL_SPEED, abs=1e-17
+        )
 
 
 def test_hard_set_painleve_meets_the_condition_of_the_paradox():
@@ -51,7 +61,15 @@ def test_hard_set_painleve_meets_the_condition_of_the_paradox():
 
 
 @pytest.mark.parametrize(
-    "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box(mass_ratio=400)", "slab(n=5)"]
+    "name",
+    [
+        "arch",
+        "arch(n=25)",
+        "card_house",
+        "card_house(levels=5)",
+        "big_box(mass_ratio=400)",
+        "slab(n=5)",
+    ],
 )
 def test_hard_set_structures_at_rest_do_not_move_only_with_friction(name):
     case = suite.case(name)

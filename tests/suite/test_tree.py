@@ -22,7 +22,14 @@ from lavender.solving.stages import DecisionTree, Stage
 def rates(monkeypatch):
     """Fix the rates: which stage comes first depends on them, how stages follow each other does not."""
     work = {"bodies": 0.2, "dense": 0.04, "panels": 0.4, "velocities": 0.1}
-    fixed = {"start": 1e5, "row": 300.0, "entry": 0.25, "work": work, "sweep row": 12.0, "sweep cone": 2.0}
+    fixed = {
+        "start": 1e5,
+        "row": 300.0,
+        "entry": 0.25,
+        "work": work,
+        "sweep row": 12.0,
+        "sweep cone": 2.0,
+    }
     for name, rate in (fixed | {"pivot row": 100.0, "pivot work": 0.2}).items():
         monkeypatch.setitem(costs.RATES, name, rate)
 
@@ -30,7 +37,9 @@ def rates(monkeypatch):
 def asymmetric():
     """The law of a matrix with a positive definite half, and a large other one."""
     half, other = np.random.default_rng(0).standard_normal((2, 80, 80))
-    return lv.Problem.lcp(half @ half.T / 80.0 + 0.1 * np.eye(80) + 0.2 * (other - other.T), other[0])
+    return lv.Problem.lcp(
+        half @ half.T / 80.0 + 0.1 * np.eye(80) + 0.2 * (other - other.T), other[0]
+    )
 
 
 def transport_plan():
@@ -59,8 +68,12 @@ PROBLEMS = {
     "bounded rows, not symmetric": asymmetric,
     "bounded rows, few": lambda: random_lcp(1, m=12),
     "the cone law": lambda: suite.granular(n=6, friction="coulomb").problem.relaxed("cone"),
-    "the cone law, a matrix": lambda: as_matrix(suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone")),
-    "the cone law, few rows of J and M": lambda: random_generalized_problem(1, "cone", 6, True, contacts=3),
+    "the cone law, a matrix": lambda: as_matrix(
+        suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone")
+    ),
+    "the cone law, few rows of J and M": lambda: random_generalized_problem(
+        1, "cone", 6, True, contacts=3
+    ),
     "a loose pile": lambda: suite.granular(n=4, friction="coulomb").problem,
     "a loose pile, a matrix": lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem),
     "a loose pile, J and M": lambda: general(suite.case("granularF(n=6, seed=2)").problem),
@@ -76,7 +89,9 @@ PLANS = {  # solved elsewhere, or too large
         round_cones().b, round_cones().cones, round_cones().csr, friction="cone"
     ),
     "a transport plan": transport_plan,
-    "a large pyramid that slides": lambda: suite.case("pyramidF(k=12, sliding=0.5, mass_ratio=3)").problem,
+    "a large pyramid that slides": lambda: (
+        suite.case("pyramidF(k=12, sliding=0.5, mass_ratio=3)").problem
+    ),
     "a pyramid that slides": lambda: suite.case("pyramidF(k=6, sliding=0.5)").problem,
 }
 
@@ -96,8 +111,12 @@ def test_stages_that_auto_plans_are_the_approved_ones():
     for name, make in (PROBLEMS | PLANS).items():
         problem = make()
         plan = lv.explain(problem)
-        assert all(stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in plan.stages)
-        methods = {stage.solver.split()[0] for stage in plan.stages if stage.solver != "certificate"}
+        assert all(
+            stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in plan.stages
+        )
+        methods = {
+            stage.solver.split()[0] for stage in plan.stages if stage.solver != "certificate"
+        }
         assert [method for method in methods if registry.get(method).refuses(problem)] == []
         tree = DecisionTree(problem)
         round_of_turns = [stage.solver for stage in tree.iterate_one_round(1.0)]
@@ -137,7 +156,9 @@ def test_explain_is_reproducible_and_rejects_wrong_input():
         partial(wild, 99750),  # newton stalls from what sweeps leave, and not from nothing
         partial(drawn, 99529, part="judged"),  # the second turn brings admm on the way
         partial(drawn, 99860, part="judged"),  # newton gains nothing in hundreds of factorisations
-        partial(drawn, 102121, part="judged"),  # rows of A after velocities stall, for more than is left as counted
+        partial(
+            drawn, 102121, part="judged"
+        ),  # rows of A after velocities stall, for more than is left as counted
     ],
     ids=lambda make: f"{make.func.__name__}{make.args}",
 )
@@ -153,7 +174,9 @@ def test_auto_continues_over_rows_of_a_if_newton_over_velocities_fails():
     moved = rng.standard_normal(150)
     target = jac @ moved - rng.exponential(0.5, 400) * (rng.random(400) < 0.7)
     cones = lv.Cones.bounded(np.zeros(400), np.full(400, np.inf))
-    problem = lv.Problem.from_jacobian(jac, half @ half.T, np.zeros(150), target=target, cones=cones)
+    problem = lv.Problem.from_jacobian(
+        jac, half @ half.T, np.zeros(150), target=target, cones=cones
+    )
     solution = lv.solve(problem, tol=1e-6)
     assert solution.success, solution.stages
 
@@ -179,7 +202,9 @@ def test_newton_of_transport_plan_factors_sparse_rows_of_a():
 
 def test_auto_proves_that_squeezed_bodies_have_no_solution_before_it_alternates():
     """Floor and ceiling close in on each body, under Coulomb's law, where no method of ours proves it."""
-    down = np.vstack([np.eye(3), np.diag([-1.0, 1.0, 1.0])])  # each contact: normal and two tangents
+    down = np.vstack(
+        [np.eye(3), np.diag([-1.0, 1.0, 1.0])]
+    )  # each contact: normal and two tangents
     a = np.kron(np.eye(20), down @ down.T)
     problem = lv.Problem(np.tile([1.0, 0.1, 0.0], 40), lv.Cones.contacts(np.full(40, 0.5)), a)
     found = lv.solve(problem)
@@ -200,7 +225,9 @@ def test_auto_with_a_velocity_moved_by_1e_47_only_proves_the_conflict(unit):
     target[::3] = 3.0 * np.abs(target[::3])
     cones = lv.Cones.contacts(0.3, count=3)
     mass = min(unit, 1e40) * np.eye(7)
-    found = lv.solve(lv.Problem.from_jacobian(unit * jac, mass, np.zeros(7), target=unit * target, cones=cones))
+    found = lv.solve(
+        lv.Problem.from_jacobian(unit * jac, mass, np.zeros(7), target=unit * target, cones=cones)
+    )
     assert not found.success and found.claim_check == "confirmed"
     assert found.status is lv.Status.INFEASIBLE or unit > 1.0
 

@@ -28,7 +28,11 @@ def test_backend_answer_is_at_most_ten_times_worse_than_the_backend_alone(name, 
 @pytest.mark.parametrize("kind", ["lcp", "program"])
 def test_backend_started_near_its_answer_needs_at_most_half_of_the_iterations(name, kind):
     program = draw_lcp(0) if kind == "lcp" else draw_program(0)
-    problem = lv.Problem.lcp(program["P"], -program["q"]) if kind == "lcp" else lv.Problem.from_qp(**program)
+    problem = (
+        lv.Problem.lcp(program["P"], -program["q"])
+        if kind == "lcp"
+        else lv.Problem.from_qp(**program)
+    )
     start = lv.solve(problem, "clarabel", tol=1e-9).impulse * (1.0 + 1e-12)
     cold = lv.solve(problem, name)
     warm = lv.solve(problem, name, impulse=start)
@@ -56,7 +60,9 @@ def test_backend_form_is_the_named_one_or_that_of_the_problem():
     program = draw_program(0)
     definite = lv.Problem.from_qp(**program)
     singular = lv.Problem.from_qp(**draw_program(1))
-    assert choose_program_form(definite, "auto") == choose_program_form(singular, "auto") == "program"
+    assert (
+        choose_program_form(definite, "auto") == choose_program_form(singular, "auto") == "program"
+    )
     for form in ("impulse", "velocity", "program"):
         solution = lv.solve(definite, "clarabel", form=form)
         assert solution.success and solution.solver.form == form
@@ -67,7 +73,9 @@ def test_backend_form_is_the_named_one_or_that_of_the_problem():
         lv.solve(lv.Problem.lcp(*spd(3)), "clarabel", form="program")
     jac = np.eye(2, 3)
     regular, repeated = (
-        lv.Problem.from_jacobian(rows, np.eye(3), np.ones(3), cones=lv.Cones.bounded(np.zeros(len(rows)), np.inf))
+        lv.Problem.from_jacobian(
+            rows, np.eye(3), np.ones(3), cones=lv.Cones.bounded(np.zeros(len(rows)), np.inf)
+        )
         for rows in (jac, np.vstack([jac, jac[:1]]))
     )
     assert choose_program_form(regular, "auto") == "impulse"
@@ -76,7 +84,9 @@ def test_backend_form_is_the_named_one_or_that_of_the_problem():
 
 @pytest.mark.parametrize("name", installed("osqp", "daqp", "clarabel", "highs"))
 def test_solve_qp_of_an_ill_conditioned_program_is_solved_by_named_backends(name):
-    program = draw_program(47)  # P has rank 17 of 18, and rounding makes it definite with a condition of 1e13
+    program = draw_program(
+        47
+    )  # P has rank 17 of 18, and rounding makes it definite with a condition of 1e13
     assert not lv.Problem.from_qp(**program).has_singular_program
     here, solution = call_here(program, name, False)
     assert here <= TOL and solution.success
@@ -84,7 +94,10 @@ def test_solve_qp_of_an_ill_conditioned_program_is_solved_by_named_backends(name
 
 def test_backend_form_has_a_p_that_is_symmetric_in_every_bit():
     problem = lv.Problem.lcp(*spd(9, seed=1))
-    for program in (build_form(problem, "impulse").program, get_program(lv.Problem.from_qp(**draw_program(6)).qp)):
+    for program in (
+        build_form(problem, "impulse").program,
+        get_program(lv.Problem.from_qp(**draw_program(6)).qp),
+    ):
         P = program.scaled.get_hessian(True)
         assert (P == P.T).all()
 

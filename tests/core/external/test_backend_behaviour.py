@@ -26,14 +26,18 @@ def mark_slow(names):
 @pytest.mark.parametrize("name", mark_slow(BACKENDS))
 def test_backend_multipliers_of_active_bounds_are_not_zero(name):
     """pyqpmad returns zeros for multipliers of bounds."""
-    problem = lv.Problem.from_qp([[2.0, 0.5], [0.5, 1.0]], [0.0, 1.0], lb=[1.0, -2.0], ub=[1.0, 2.0])
+    problem = lv.Problem.from_qp(
+        [[2.0, 0.5], [0.5, 1.0]], [0.0, 1.0], lb=[1.0, -2.0], ub=[1.0, 2.0]
+    )
     if registry.get(name).refuses(problem) is not None:
         pytest.skip(f"{name} does not accept programs")
     answer = lv.solve_qp(problem, name, tol=1e-6)
     if "license" in answer.solution.message:
         pytest.skip(f"{name} has no licence")
     assert answer.found
-    np.testing.assert_allclose(answer.z_box, [-1.25, 0.0], atol=1e-5)  # of a relative residual of 1e-6
+    np.testing.assert_allclose(
+        answer.z_box, [-1.25, 0.0], atol=1e-5
+    )  # of a relative residual of 1e-6
 
 
 @pytest.mark.parametrize("name", mark_slow(BACKENDS))
@@ -72,7 +76,9 @@ def test_description_of_a_backend_has_its_observations_and_what_its_adapter_does
 def test_note_of_a_contradicted_row_of_the_check_quotes_the_table():
     problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [0.0, -1e-7], lb=[0.0, 0.0], ub=[1.0, 1.0])
     solution = lv.solve(problem, "auto", max_iter=0)
-    contradicted = replace(solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x")
+    contradicted = replace(
+        solution, status=lv.Status.CONVERGED, claim_check="contradicted", status_conflict="x"
+    )
     row = compare_with_reference(problem, "daqp", contradicted, None)
     assert "observed with daqp" in row.note and "x2 = 0.03" in row.note
     task = {"solver": "daqp", "mode": "tol"}

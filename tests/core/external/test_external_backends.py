@@ -25,7 +25,11 @@ def replaced(register, name, call):
     from functools import partial
 
     backend = next(b for b in backends.BACKENDS if b.name == name)
-    register(replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call))))
+    register(
+        replace(
+            registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call))
+        )
+    )
 
 
 def test_every_backend_of_qpsolvers_is_known():
@@ -58,10 +62,15 @@ def test_backend_prints_nothing_imports_nothing_and_runs_in_threads(name, capfd,
         assert finder.asked == []
         with ThreadPoolExecutor(4) as pool:
             for found in pool.map(lambda _, p=problem: lv.solve(p, name), range(8)):
-                assert (found.impulse.tobytes(), found.status) == (alone.impulse.tobytes(), alone.status)
+                assert (found.impulse.tobytes(), found.status) == (
+                    alone.impulse.tobytes(),
+                    alone.status,
+                )
         assert (sys.stdout, warnings.filters) == before
     assert capfd.readouterr() == ("", "")
-    with pytest.raises(KeyboardInterrupt):  # some backends handle Ctrl-C themselves while they solve
+    with pytest.raises(
+        KeyboardInterrupt
+    ):  # some backends handle Ctrl-C themselves while they solve
         signal.raise_signal(signal.SIGINT)
 
 
@@ -115,7 +124,9 @@ def test_backend_on_empty_or_fixed_problems_is_not_called(name):
     empty = lv.Problem.lcp(np.zeros((0, 0)), [])  # no row is bounded: its law is linear
     if registry.get(name).refuses(empty) is None:
         assert lv.solve(empty, name).success
-    fixed = lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0], lower=[0.5, 2.0], upper=[0.5, 2.0]), name)
+    fixed = lv.solve(
+        lv.Problem.lcp(np.eye(2), [1.0, 1.0], lower=[0.5, 2.0], upper=[0.5, 2.0]), name
+    )
     assert fixed.success
     assert fixed.impulse.tolist() == [0.5, 2.0]
     assert fixed.work == {"backend_calls": 0}
@@ -163,11 +174,15 @@ def test_backend_uses_a_start_if_its_spec_says_so(name):
         assert warm.work == cold.work
 
 
-APART = [b.name for b in backends.BACKENDS if (not b.stoppable or b.overruns) and b.name in BACKENDS]
+APART = [
+    b.name for b in backends.BACKENDS if (not b.stoppable or b.overruns) and b.name in BACKENDS
+]
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_its_own(name, monkeypatch):
+def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_its_own(
+    name, monkeypatch
+):
     from lavender.external import isolated
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
@@ -189,10 +204,14 @@ def test_backend_with_a_time_limit_runs_in_a_separate_process_if_it_has_none_of_
         assert "ran in a separate process" in there.message and "ran to its end" in here.message
     assert plain.success and "time limit" not in plain.message
     for other in (there, here):
-        assert ("; the backend " in other.message and " and ran " in other.message) == (name in APART)
+        assert ("; the backend " in other.message and " and ran " in other.message) == (
+            name in APART
+        )
         assert other.status is plain.status
         assert other.work == plain.work
-        if name == "proxqp":  # Its vectorised sums depend on the alignment of memory, in one process, too.
+        if (
+            name == "proxqp"
+        ):  # Its vectorised sums depend on the alignment of memory, in one process, too.
             np.testing.assert_allclose(other.impulse, plain.impulse, rtol=0.0, atol=1e-13)
         else:
             assert other.impulse.tobytes() == plain.impulse.tobytes()
@@ -234,7 +253,9 @@ def test_isolated_process_survives_a_limit_of_the_backend(name, monkeypatch):
     from lavender.external import isolated
     from lavender.external.isolated import idle_processes
 
-    monkeypatch.setattr(isolated, "MIN_STOPPABLE_TIME", 600.0)  # Only the backend's own limit ends the call.
+    monkeypatch.setattr(
+        isolated, "MIN_STOPPABLE_TIME", 600.0
+    )  # Only the backend's own limit ends the call.
     problem = lv.Problem.lcp(*spd(300, seed=3))
     lv.solve(lv.Problem.lcp(*spd(5)), name, isolate=True)
     before = [process.popen for process in idle_processes]
@@ -289,15 +310,25 @@ def answers(register, *given):
     [
         (ValueError("it broke"), lv.Status.NUMERICAL_ERROR, "ValueError: it broke"),
         (MemoryError("it broke"), lv.Status.NUMERICAL_ERROR, "MemoryError: it broke"),
-        (type("Panic", (BaseException,), {})("it broke"), lv.Status.NUMERICAL_ERROR, "Panic: it broke"),
+        (
+            type("Panic", (BaseException,), {})("it broke"),
+            lv.Status.NUMERICAL_ERROR,
+            "Panic: it broke",
+        ),
         (KeyboardInterrupt(), lv.Status.INTERRUPTED, ""),
         *(
-            (Answer(lv.Status.CONVERGED, "gave up", x), lv.Status.NUMERICAL_ERROR, "gave up; no iterate")
+            (
+                Answer(lv.Status.CONVERGED, "gave up", x),
+                lv.Status.NUMERICAL_ERROR,
+                "gave up; no iterate",
+            )
             for x in (None, np.array([np.nan, 1.0, 1.0]), np.zeros(2))
         ),
     ],
 )
-def test_an_exception_and_no_iterate_become_a_result_at_the_start_point(register, given, status, words):
+def test_an_exception_and_no_iterate_become_a_result_at_the_start_point(
+    register, given, status, words
+):
     answers(register, given)
     start = np.array([0.1, 0.2, 0.3])
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
@@ -310,7 +341,12 @@ def test_an_exception_and_no_iterate_become_a_result_at_the_start_point(register
     [
         (False, True, "confirmed", "auto found the certificate"),
         (True, True, "contradicted", "auto found a solution"),
-        (True, False, "not proven", "not proven: no certificate was given"),  # too many rows for our own search
+        (
+            True,
+            False,
+            "not proven",
+            "not proven: no certificate was given",
+        ),  # too many rows for our own search
     ],
 )
 def test_backend_claim_of_infeasibility_without_a_certificate_is_checked_by_auto(
@@ -330,16 +366,26 @@ def test_backend_claim_of_infeasibility_without_a_certificate_is_checked_by_auto
 
 def test_newton_step_removes_an_error_of_the_backend(register):
     def rough(program, limit):  # A is the unit matrix: the solution is -q
-        return Answer(lv.Status.CONVERGED, "solved", -1.001 * program.q, np.zeros(len(program.t)), {"iterations": 7})
+        return Answer(
+            lv.Status.CONVERGED,
+            "solved",
+            -1.001 * program.q,
+            np.zeros(len(program.t)),
+            {"iterations": 7},
+        )
 
     asked = answers(register, rough)
     solution = lv.solve(lv.Problem.lcp(np.eye(3), np.ones(3)), "osqp", tol=1e-12)
     assert solution.success and len(asked) == 1 and solution.iterations == 7
 
 
-@pytest.mark.parametrize("later", [lv.Status.INFEASIBLE, lv.Status.NUMERICAL_ERROR, lv.Status.TIME_LIMIT])
+@pytest.mark.parametrize(
+    "later", [lv.Status.INFEASIBLE, lv.Status.NUMERICAL_ERROR, lv.Status.TIME_LIMIT]
+)
 def test_backend_second_call_that_fails_keeps_the_first_answer(later, register):
-    def wrong_bound(program, limit):  # lambda_0 at its bound, although it is positive at the solution
+    def wrong_bound(
+        program, limit
+    ):  # lambda_0 at its bound, although it is positive at the solution
         x = -(1.0 + 1e-9) * program.q
         lam = np.full(len(program.t), 1e3)
         return Answer(lv.Status.CONVERGED, "solved", x, lam)

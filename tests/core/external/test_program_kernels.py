@@ -23,7 +23,9 @@ def draw_program(seed, n=9):
     high = np.full(n, np.inf)
     low[:4], high[2:6] = -0.5, 0.5
     low[7] = high[7] = 0.25
-    qp = Problem.from_qp(P, rng.normal(size=n) * unit, G, np.ones(5), A, np.zeros(2), low / unit, high / unit).qp
+    qp = Problem.from_qp(
+        P, rng.normal(size=n) * unit, G, np.ones(5), A, np.zeros(2), low / unit, high / unit
+    ).qp
     return get_program(qp)
 
 
@@ -39,7 +41,9 @@ def test_newton_step_solves_the_equations_of_active_rows(seed):
     x = rng.normal(size=9)
     lam = rng.normal(size=m)
     scaled = program.scaled
-    step = NewtonStep(scaled.P, scaled.q, scaled.J, scaled.t, program.variable, program.scales, active, x, lam)
+    step = NewtonStep(
+        scaled.P, scaled.q, scaled.J, scaled.t, program.variable, program.scales, active, x, lam
+    )
     dense = step.make_dense(0.125)
     columns = sp.csc_array(step.make_columns(0.125), (step.size, step.size))
     np.testing.assert_array_equal(columns.toarray(), dense)
@@ -60,17 +64,23 @@ def test_columns_are_the_transposed_selected_rows():
     J = make_dense(program.J, 9)
     rows = np.array([0, 4, 2], np.int32)
     np.testing.assert_array_equal(make_dense(program.J, 9, rows, -1.0), -J[rows])
-    np.testing.assert_array_equal(sp.csc_array(make_columns(program.J, 9, rows, 2.0), (3, 9)).toarray(), 2.0 * J[rows])
+    np.testing.assert_array_equal(
+        sp.csc_array(make_columns(program.J, 9, rows, 2.0), (3, 9)).toarray(), 2.0 * J[rows]
+    )
     upper = sp.csc_array(make_columns(program.P, 9, None, 1.0, True), (9, 9)).toarray()
     np.testing.assert_array_equal(upper, np.triu(make_dense(program.P, 9)))
 
 
-@pytest.mark.parametrize(("deadline", "largest"), [(NEVER, 20_000), (Deadline(60.0), 20_000), (Deadline(0.04), 300)])
+@pytest.mark.parametrize(
+    ("deadline", "largest"), [(NEVER, 20_000), (Deadline(60.0), 20_000), (Deadline(0.04), 300)]
+)
 def test_no_long_step_begins_shortly_before_the_deadline(monkeypatch, deadline, largest):
     program = draw_program(0)
     sizes = []
     judge = ProgramJudge(program, 1e-6, deadline)
-    monkeypatch.setattr(type(program), "polish", lambda self, x, lam, active, size: sizes.append(size))
+    monkeypatch.setattr(
+        type(program), "polish", lambda self, x, lam, active, size: sizes.append(size)
+    )
     judge.accepts(np.zeros(9), np.zeros(len(program.t)))
     assert set(sizes) <= {largest}
     assert sizes or deadline.is_set

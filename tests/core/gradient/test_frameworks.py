@@ -37,9 +37,14 @@ def test_gradient_of_broadcast_arguments_is_summed():
     frees = np.stack([free, free + 1e-3])
     velocity, impulse = made.forward(jac, mass, frees, mu, target, soft)
     assert velocity.shape == (2, 5) and impulse.shape == (2, 6)
-    both = made.backward(EVERY, jac, mass, frees, mu, target, soft, impulse, np.ones((2, 5)), np.ones((2, 6)))
+    both = made.backward(
+        EVERY, jac, mass, frees, mu, target, soft, impulse, np.ones((2, 5)), np.ones((2, 6))
+    )
     alone = [
-        made.backward(EVERY, jac, mass, frees[i], mu, target, soft, impulse[i], np.ones(5), np.ones(6)) for i in (0, 1)
+        made.backward(
+            EVERY, jac, mass, frees[i], mu, target, soft, impulse[i], np.ones(5), np.ones(6)
+        )
+        for i in (0, 1)
     ]
     for i, (x, y, z) in enumerate(zip(both, *alone, strict=True)):
         assert x == pytest.approx(np.stack([y, z]) if i == 2 else y + z, rel=1e-12, abs=1e-12)
@@ -62,7 +67,9 @@ def test_layer_without_contacts_returns_the_free_velocity_and_its_gradient(lead)
 def twice(by_mu):
     """A contact given twice: there is a gradient by the friction that both have, none by their J."""
     jac = np.concatenate([np.eye(3)[[2, 0, 1]]] * 2)
-    assert by_mu(jac, 2.0 * np.eye(3), np.array([2.0, 0.0, -1.0]), np.array([0.4, 0.4])) == pytest.approx(-1.0)
+    assert by_mu(
+        jac, 2.0 * np.eye(3), np.array([2.0, 0.0, -1.0]), np.array([0.4, 0.4])
+    ) == pytest.approx(-1.0)
 
 
 def torch_and_solve():
@@ -102,7 +109,9 @@ def test_batches_of_torch():
     solve(*stacked[:4], target=stacked[4], compliance=stacked[5])[0].sum().backward()
     assert torch.allclose(by_mu, stacked[3].grad, rtol=1e-9)
     frees = stacked[2][0] + 1e-3 * torch.arange(4, dtype=torch.float64)[:, None]
-    one = torch.func.vmap(lambda v: each(*(x[0] for x in stacked[:2]), v, *(x[0].detach() for x in stacked[3:]))[0])
+    one = torch.func.vmap(
+        lambda v: each(*(x[0] for x in stacked[:2]), v, *(x[0].detach() for x in stacked[3:]))[0]
+    )
     assert one(frees).shape == (4, 5)
 
 
@@ -122,7 +131,15 @@ def test_check_grads_of_jax(given):
     def function(J, M, v_free, mu, target, compliance):
         return solve(J, M, v_free, mu, target=target, compliance=compliance, tol=1e-14)
 
-    check_grads(function, tuple(map(jax.numpy.asarray, given)), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
+    check_grads(
+        function,
+        tuple(map(jax.numpy.asarray, given)),
+        order=1,
+        modes=["rev"],
+        eps=1e-6,
+        atol=1e-5,
+        rtol=1e-5,
+    )
 
 
 def test_batches_and_jit_of_jax():
@@ -155,7 +172,9 @@ def test_vmap_of_jax_is_before_a_batch_inside():
         return solve(J, mass, frees, mu, target=target, compliance=soft)[0]
 
     for function in (push, jax.grad(lambda J: push(J).sum())):
-        assert np.allclose(jax.vmap(function)(many), np.stack([function(J) for J in many]), rtol=1e-9)
+        assert np.allclose(
+            jax.vmap(function)(many), np.stack([function(J) for J in many]), rtol=1e-9
+        )
 
 
 def test_torch_layer_computes_only_required_gradients():

@@ -40,7 +40,10 @@ def test_derivative_jvp_agrees_with_differences_of_solutions(kind, law, operator
             wanted = (ends[1].slack - ends[0].slack) / (2.0 * H)
             assert np.abs(found.slack - wanted).max() <= CLOSE * size, (seed, name)
             if p.matrix is None:
-                ends = [moved(p, name, change, h).velocity(x.impulse) for h, x in zip((-H, H), ends, strict=True)]
+                ends = [
+                    moved(p, name, change, h).velocity(x.impulse)
+                    for h, x in zip((-H, H), ends, strict=True)
+                ]
                 wanted = (ends[1] - ends[0]) / (2.0 * H)
                 assert np.abs(found.velocity - wanted).max() <= CLOSE * size, (seed, name)
         return
@@ -76,7 +79,10 @@ def test_derivative_states_of_rows_and_components_are_documented_ones():
     solution = lv.solve(p, tol=1e-12)
     assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
     assert [s.margin for s in solution.states[:3]] == pytest.approx([1.0, 1.0, 1.0])
-    assert solution.state(3).margin == 0.0 and str(solution.state(0)) == "free, 1 N s from another state"
+    assert (
+        solution.state(3).margin == 0.0
+        and str(solution.state(0)) == "free, 1 N s from another state"
+    )
     with pytest.raises(IndexError, match="block 4 does not exist; there are 4"):
         solution.state(4)
     spin = lv.Problem(np.array([10.0, 9.0, 0.0, 0.5]), lv.Cones.contacts(0.5, 2, 1.0), np.eye(4))
@@ -103,9 +109,14 @@ def test_derivative_states_fit_impulse_and_slack(kind):
             elif name == "at a bound":
                 assert min(abs(lam[j] - c.lower[j]), abs(lam[j] - c.upper[j])) < near
         if state.name == "slides" and len(rows) == 3 and "box" not in kind:
-            reach = np.where(c.friction_coefficient[rows[1:]] > 0.0, c.friction_coefficient[rows[1:]], 1.0)
+            reach = np.where(
+                c.friction_coefficient[rows[1:]] > 0.0, c.friction_coefficient[rows[1:]], 1.0
+            )
             share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
-            assert share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6) or kind == "smooth"
+            assert (
+                share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6)
+                or kind == "smooth"
+            )
 
 
 def test_derivative_of_dependent_rows_gives_velocities_and_rejects_impulses():
@@ -118,7 +129,8 @@ def test_derivative_of_dependent_rows_gives_velocities_and_rejects_impulses():
     total = d.vjp(impulse=np.ones(4))  # their sum is unique: the weight
     assert total.v_free == pytest.approx([-1.0, 0.0, 0.0], abs=1e-9)
     with pytest.raises(
-        lv.CapabilityError, match=r"gradient is not unique: impulse: not of 4 rows \(row 0, row 1, row 2, ..."
+        lv.CapabilityError,
+        match=r"gradient is not unique: impulse: not of 4 rows \(row 0, row 1, row 2, ...",
     ):
         d.vjp(impulse=[1.0, 0.0, 0.0, 0.0])
     t = d.jvp(v_free=[0.3, 0.2, 0.1])
@@ -162,14 +174,23 @@ def test_derivatives_of_a_batch_equal_single_gradients():
     # one after the other, of what the compiled call takes and of what goes alone: a matrix, a singular system
     rng = np.random.default_rng(0)
     problems = [drawn(seed, "disk", "cone", "generalized") for seed in range(3)]
-    twice = lv.Problem.from_jacobian(np.ones((2, 1)), np.eye(1), [-1.0], cones=lv.Cones.bounded(np.zeros(2), np.inf))
+    twice = lv.Problem.from_jacobian(
+        np.ones((2, 1)), np.eye(1), [-1.0], cones=lv.Cones.bounded(np.zeros(2), np.inf)
+    )
     for given in (problems, [*problems, twice, drawn(3, "ellipse", "cone", "generalized")]):
         solutions = lv.solve_many(given, tol=1e-12)
         weights = [rng.standard_normal(p.generalized.nv) for p in given]
-        for answers in (solutions, [s.impulse for s in solutions], [s.impulse.tolist() for s in solutions]):
+        for answers in (
+            solutions,
+            [s.impulse for s in solutions],
+            [s.impulse.tolist() for s in solutions],
+        ):
             d = lv.derivatives(given, answers)
             found = d.vjp(velocity=weights)
-            each = [lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)]
+            each = [
+                lv.derivative(p, s).vjp(velocity=y)
+                for p, s, y in zip(given, solutions, weights, strict=True)
+            ]
             assert np.array_equal(found.v_free, np.concatenate([g.v_free for g in each]))
             assert np.array_equal(pickle.loads(pickle.dumps(found)).v_free, found.v_free)
             assert np.array_equal(found.mu, np.concatenate([g.mu for g in each]))
@@ -197,10 +218,14 @@ def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solut
     found = lv.derivatives(batch, solutions).vjp(velocity=np.ones((3, 7)))
     for i, g in enumerate(found):
         alone = lv.derivative(batch[i], solutions[i]).vjp(velocity=np.ones(7))
-        assert np.array_equal(g.b, alone.b) and np.array_equal(found.v_free[7 * i : 7 * i + 7], alone.v_free)
+        assert np.array_equal(g.b, alone.b) and np.array_equal(
+            found.v_free[7 * i : 7 * i + 7], alone.v_free
+        )
     with pytest.raises(lv.InputError, match="problem 0: the impulse is not a solution"):
         lv.derivatives(batch[::-1], solutions)
-    assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
+    assert (
+        len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
+    )
 
 
 @pytest.mark.parametrize("count", [3, 170])  # dense; sparse
@@ -216,12 +241,16 @@ def test_derivative_of_contacts_given_twice_equals_that_of_given_once(law, count
     for times in (1, 2):
         rows = np.concatenate([jac] * times)
         cones = lv.Cones.contacts(np.full(count * times, 0.4), size)
-        made.append(lv.Problem.from_jacobian(rows, np.eye(jac.shape[1]), free, cones=cones, friction="cone"))
+        made.append(
+            lv.Problem.from_jacobian(rows, np.eye(jac.shape[1]), free, cones=cones, friction="cone")
+        )
     found = [lv.derivative(p, lv.solve(p, "newton", tol=1e-12)) for p in made]
     assert found[0].unique and not found[1].unique.impulse.all() and found[1].unique.slack.all()
     closed = [d.states.case[: each * count : each] != 0 for d in found]
     assert np.array_equal(*closed)
-    assert np.array_equal(found[1].unique.impulse[: each * count : each], ~closed[1])  # what is open is unique
+    assert np.array_equal(
+        found[1].unique.impulse[: each * count : each], ~closed[1]
+    )  # what is open is unique
     y, push = rng.standard_normal((2, jac.shape[1]))
     once, twice = (d.vjp(velocity=y).v_free for d in found)
     assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
@@ -245,7 +274,8 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
         monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "MAX_KERNEL_ROWS", small)
         monkeypatch.setattr("lavender.gradient.system.MAX_DENSE_ROWS", dense)
         monkeypatch.setattr(
-            "lavender.gradient.system.is_dense_factor_faster", lambda nnz, m, cones, few=few: few == 0.0
+            "lavender.gradient.system.is_dense_factor_faster",
+            lambda nnz, m, cones, few=few: few == 0.0,
         )
         d = lv.derivative(p, solution)
         found.append(d.vjp(**weights))
@@ -306,7 +336,10 @@ def test_derivative_by_one_of_several_redundant_rows_raises():
     # Under the cone law it slides off at mu |w_t|: of one corner alone that is a target, too.
     p = p.relaxed("cone")
     d = lv.derivative(p, lv.solve(p, tol=1e-13))
-    for refused in (lambda: d.vjp(velocity=np.eye(6)[0]).mu, lambda: d.jvp(mu=[1.0, 0.0, 0.0, 0.0])):
+    for refused in (
+        lambda: d.vjp(velocity=np.eye(6)[0]).mu,
+        lambda: d.jvp(mu=[1.0, 0.0, 0.0, 0.0]),
+    ):
         with pytest.raises(lv.CapabilityError, match="share a load"):
             refused()
     assert d.jvp(mu=np.ones(4)).velocity[0] < 0.0

@@ -26,7 +26,9 @@ def tangled(seed, contacts, joints, bodies=None, kind="disks"):
     return KINDS[kind](seed, bodies=bodies, joints=joints, contacts=contacts)
 
 
-@pytest.mark.parametrize("order", ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"])
+@pytest.mark.parametrize(
+    "order", ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"]
+)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("contacts", "joints"), [(19, 4), (25, 3), (301, 40), (30, 200)])
 def test_packed_sweeps_of_any_length_have_the_bits_of_plain_ones(order, kind, contacts, joints):
@@ -35,16 +37,28 @@ def test_packed_sweeps_of_any_length_have_the_bits_of_plain_ones(order, kind, co
     order = rng.permutation(problem.n_blocks) if order == "array" else order
     for counts in ([7], [1, 2, 16, 1, 3, 9, 2], [*rng.integers(1, 20, 6).tolist(), 30]):
         pairs, _ = sweep_packed(problem, counts, order=order)
-        if problem.n_blocks < 24 or max(counts) < 8 or (kind == "one tangent" and contacts > joints):
+        if (
+            problem.n_blocks < 24
+            or max(counts) < 8
+            or (kind == "one tangent" and contacts > joints)
+        ):
             assert pairs == 0
         elif problem.n_blocks > 100:  # else too few may be free of each other
             assert pairs > 0
 
 
-@pytest.mark.parametrize("order", ["given", "reverse", "symmetric", "bottom_up", "colored", "array"])
-@pytest.mark.parametrize(("name", "options"), [("nncg", {}), ("nncg", {"convex": 20}), ("anderson", {})])
-@pytest.mark.parametrize(("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")])
-def test_packed_pairs_in_single_sweeps_have_the_bits_of_plain_ones(order, name, options, contacts, joints, kind):
+@pytest.mark.parametrize(
+    "order", ["given", "reverse", "symmetric", "bottom_up", "colored", "array"]
+)
+@pytest.mark.parametrize(
+    ("name", "options"), [("nncg", {}), ("nncg", {"convex": 20}), ("anderson", {})]
+)
+@pytest.mark.parametrize(
+    ("contacts", "joints", "kind"), [(24, 0, "disks"), (301, 40, "spin"), (300, 40, "mixed")]
+)
+def test_packed_pairs_in_single_sweeps_have_the_bits_of_plain_ones(
+    order, name, options, contacts, joints, kind
+):
     problem = tangled(contacts, contacts, joints, kind=kind)
     is_named = order != "array"
     rng = np.random.default_rng(contacts)
@@ -79,7 +93,11 @@ def test_checks_between_packed_sweeps_judge_the_same_iterates(name, order, tol):
     both = [prepare_sweeps(pile, name, packs, order=order) for packs in (True, False)]
     a, b = (prepared.solve(tol=tol, max_iter=300) for prepared in both)
     assert both[0].state.sweeps.records[0] > 0
-    assert (a.status, a.iterations, a.impulse.tobytes()) == (b.status, b.iterations, b.impulse.tobytes())
+    assert (a.status, a.iterations, a.impulse.tobytes()) == (
+        b.status,
+        b.iterations,
+        b.impulse.tobytes(),
+    )
 
 
 def test_packed_workspace_is_reused_for_a_new_problem():

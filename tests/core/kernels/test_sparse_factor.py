@@ -53,8 +53,12 @@ def test_dense_factor_solves_and_counts_lost_pivots(n):
     b = rng.normal(size=n)
     a = half @ half.T + np.eye(n)
     wide, narrow = (LinearSystem(n, lanes) for lanes in (True, False))
-    assert wide.factor(a, a.diagonal(), 0.0, 1e-13) == narrow.factor(a, a.diagonal(), 0.0, 1e-13) == 0
-    np.testing.assert_allclose(wide.multiply(b), a @ b, rtol=0, atol=n * EPS * np.abs(a).sum() * np.abs(b).max())
+    assert (
+        wide.factor(a, a.diagonal(), 0.0, 1e-13) == narrow.factor(a, a.diagonal(), 0.0, 1e-13) == 0
+    )
+    np.testing.assert_allclose(
+        wide.multiply(b), a @ b, rtol=0, atol=n * EPS * np.abs(a).sum() * np.abs(b).max()
+    )
     np.testing.assert_array_equal(wide.solve(b), narrow.solve(b))
     x = wide.solve(b)
     assert np.linalg.norm(a @ x - b) <= n * EPS * np.linalg.norm(a, 2) * np.linalg.norm(x)
@@ -89,7 +93,9 @@ def test_ordering_of_any_graph_is_a_permutation(n, pairs, heavy):
 def test_sparse_factor_of_trees_and_stars_fills_nothing():
     rng = np.random.default_rng(0)
     for n in (2, 50, 3000):
-        parent = np.array([rng.integers(0, i) if n < 3000 else 0 for i in range(1, n)])  # the last: a star
+        parent = np.array(
+            [rng.integers(0, i) if n < 3000 else 0 for i in range(1, n)]
+        )  # the last: a star
         a = sp.csr_array((np.ones(n - 1), (parent, np.arange(1, n))), shape=(n, n))
         a = definite(sp.csr_array(a + a.T + sp.eye_array(n)))
         f = LinearSystem(raw(a))
@@ -102,7 +108,10 @@ def test_sparse_factor_of_trees_and_stars_fills_nothing():
 def factor_of(matrix, order):
     """Columns and rows of the factor when the vertices are eliminated in that order, a column at a time."""
     a = matrix[order][:, order]
-    below = [{int(i) for i in a.indices[a.indptr[j] : a.indptr[j + 1]] if i > j} for j in range(len(order))]
+    below = [
+        {int(i) for i in a.indices[a.indptr[j] : a.indptr[j + 1]] if i > j}
+        for j in range(len(order))
+    ]
     for rows in below:
         if rows:
             parent = min(rows)
@@ -121,7 +130,10 @@ def test_sparse_factor_by_dissection_halves_the_work_on_a_cube(piles):
     order = order_for_elimination(*raw(graph))
     assert np.array_equal(np.sort(order), np.arange(len(order)))
     pattern = sp.csr_array(graph + sp.eye_array(graph.shape[0]))
-    work = [(np.diff(factor_of(pattern, x)[0]) ** 2.0).sum() for x in (order, LinearSystem(raw(pattern), True).order)]
+    work = [
+        (np.diff(factor_of(pattern, x)[0]) ** 2.0).sum()
+        for x in (order, LinearSystem(raw(pattern), True).order)
+    ]
     # The order of LinearSystem is that of minimum degree. Other software for nested dissection reaches 0.4 as well.
     assert work[0] < 0.5 * work[1]
 
@@ -131,7 +143,10 @@ def test_wide_supernodes_give_the_bits_of_two_lanes(lu):
     """Products from 16,384 entries on copy their matrices in blocks; edges of 1 to 11 rows and columns remain."""
     rng = np.random.default_rng(4)
     corner = mirrored(rng, 301, 7, 0.02)
-    a = definite(sp.block_array([[corner, None], [None, rng.normal(size=(613, 613))]]) + sp.eye_array(914, k=300))
+    a = definite(
+        sp.block_array([[corner, None], [None, rng.normal(size=(613, 613))]])
+        + sp.eye_array(914, k=300)
+    )
     found = []
     for wide in (True, False):
         f = LinearSystem(raw(a), wide)
@@ -191,7 +206,9 @@ def test_sparse_factor_with_shifts_and_lost_pivots_solves():
     free = rng.random(n) < 0.5
     place = np.where(free, np.cumsum(free) - 1, -1).astype(np.int32)
     ptr, ind, val = extract_free_part(*raw(a), a.data, place, int(free.sum()))
-    np.testing.assert_array_equal(sp.csr_array((val, ind, ptr)).toarray(), a.toarray()[np.ix_(free, free)])
+    np.testing.assert_array_equal(
+        sp.csr_array((val, ind, ptr)).toarray(), a.toarray()[np.ix_(free, free)]
+    )
     lost = LinearSystem(raw(a)).factor(np.full(a.nnz, np.nan), d, 0.0, 1e-13, True)
     assert lost > 0
     with pytest.raises(ValueError, match="entries of the analysed matrix"):
@@ -204,7 +221,9 @@ def test_sparse_factor_with_shifts_and_lost_pivots_solves():
         f.factor(a.data, d[1:])
 
 
-@pytest.mark.parametrize(("diagonal", "loses_pivots"), [(1e-9, False), (1e-12, False), (1e-20, True)])
+@pytest.mark.parametrize(
+    ("diagonal", "loses_pivots"), [(1e-9, False), (1e-12, False), (1e-20, True)]
+)
 def test_sparse_factor_without_pivots_or_digits_is_replaced_by_superlu(diagonal, loses_pivots):
     """Pivots of a chain of small diagonal are its neighbours', in other supernodes: 1e-9 is refined, 1e-20 is lost."""
     n = 200
@@ -241,7 +260,11 @@ def test_a_signal_ends_a_long_factorisation_and_leaves_no_factor():
     n = 24
     line = sp.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
     one = sp.eye_array(n)
-    grid = sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
+    grid = (
+        sp.kron(sp.kron(line, one), one)
+        + sp.kron(sp.kron(one, line), one)
+        + sp.kron(sp.kron(one, one), line)
+    )
     a = sp.csr_array(grid)
     a.sort_indices()
     system = LinearSystem((a.indptr.astype(np.int32), a.indices.astype(np.int32)))

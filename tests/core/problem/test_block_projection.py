@@ -14,7 +14,12 @@ L = np.longdouble
 H = L(1e-7)  # step of central differences: 1e-14 of truncation, 1e-12 of rounding in long double
 KINDS = CONES | {
     "rows": lambda mu, arm: lv.Cones(
-        3 * np.arange(len(mu) + 1), np.zeros(len(mu), int), -np.repeat(arm, 3), np.repeat(mu, 3), 0.0 * mu, 0.0 * mu
+        3 * np.arange(len(mu) + 1),
+        np.zeros(len(mu), int),
+        -np.repeat(arm, 3),
+        np.repeat(mu, 3),
+        0.0 * mu,
+        0.0 * mu,
     )
 }
 
@@ -52,8 +57,12 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
     cones = KINDS[kind](mu, arm)
     ptr, m = cones.ptr, cones.n_rows
     g = rng.standard_normal((n, 6, 6))
-    blocks = [x[:k, :k] @ x[:k, :k].T + 0.1 * np.eye(k) for x, k in zip(g, np.diff(ptr), strict=True)]
-    problem = lv.Problem(rng.standard_normal(m), cones, sp.block_diag(blocks, format="csr"), friction=law)
+    blocks = [
+        x[:k, :k] @ x[:k, :k].T + 0.1 * np.eye(k) for x, k in zip(g, np.diff(ptr), strict=True)
+    ]
+    problem = lv.Problem(
+        rng.standard_normal(m), cones, sp.block_diag(blocks, format="csr"), friction=law
+    )
     impulse = rng.standard_normal(m)
     impulse[ptr[:-1]] += 0.5
     linear = judge_and_linearise_impulse(problem, impulse)
@@ -73,7 +82,9 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
     for k in range(n):
         block = slice(ptr[k], ptr[k + 1])
         size = ptr[k + 1] - ptr[k]
-        components = [(list(range(1, size)), twin.mu[k])] if disk.cones.kind[k] == ROUND else twin.parts(k)
+        components = (
+            [(list(range(1, size)), twin.mu[k])] if disk.cones.kind[k] == ROUND else twin.parts(k)
+        )
         components = [(rows, a * root[block][rows[0]] / root[block][0]) for rows, a in components]
         states.add(tuple(linear.case[block]))
         p = linear.p[at : at + size**2].reshape(size, size)
@@ -81,12 +92,19 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
         expected = project(law, y[block], components)
         scale = np.abs(z[block]).max() + np.abs(s[block]).max()
         np.testing.assert_allclose(
-            (z[block] - linear.residual[block]).astype(float), expected.astype(float), rtol=0, atol=1e-14 * scale
+            (z[block] - linear.residual[block]).astype(float),
+            expected.astype(float),
+            rtol=0,
+            atol=1e-14 * scale,
         )
         if (linear.margin[block] * linear.root[block]).min() < 1e-3:
             continue  # near a kink, where differences do not converge
         derivative = np.stack(
-            [difference(lambda x, c=components: project(law, x, c), y[block], i) for i in range(size)], 1
+            [
+                difference(lambda x, c=components: project(law, x, c), y[block], i)
+                for i in range(size)
+            ],
+            1,
         )
         np.testing.assert_allclose(p, derivative.astype(float), rtol=0, atol=1e-10)
         for rows, a in components:
@@ -96,13 +114,18 @@ def test_projection_and_its_derivatives_equal_a_dense_twin(kind, law):
             unit[ptr[k] + rows[0]] = 1.0
 
             def by_coefficient(x, rows=rows, block=block, components=components):
-                return project(law, y[block], [(r, x[0] if r == rows else c) for r, c in components])
+                return project(
+                    law, y[block], [(r, x[0] if r == rows else c) for r, c in components]
+                )
 
             edge = linear.multiply_projection_derivative(unit, edge=True)[block] * (
                 root[block][0] / root[block][rows[0]]
             )
             np.testing.assert_allclose(
-                edge.astype(float), difference(by_coefficient, np.array([a], L), 0).astype(float), rtol=0, atol=1e-9
+                edge.astype(float),
+                difference(by_coefficient, np.array([a], L), 0).astype(float),
+                rtol=0,
+                atol=1e-9,
             )
     cases = np.array(
         [(*case, -1, -1, -1, -1, -1)[:6] for case in states]

@@ -7,7 +7,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import as_matrix, dragged, random_box_friction_contacts, random_ellipse_friction_contacts, seeds
+from random_problems import (
+    as_matrix,
+    dragged,
+    random_box_friction_contacts,
+    random_ellipse_friction_contacts,
+    seeds,
+)
 
 import lavender as lv
 from lavender.problem.cones import project_impulse
@@ -22,7 +28,13 @@ def free(seed, contacts=4, friction="coulomb", mu=None):
 def test_cones_shaped_to_box_and_back_are_equal():
     disk = lv.Cones.free(2) + lv.Cones.contacts([0.5, 0.3]) + lv.Cones.contacts(0.4, 1)
     assert disk.shaped("box").shaped("disk") == disk
-    assert disk.shaped("box").coefficients.tolist() == [[0, 0], [0, 0], [0.5] * 2, [0.3] * 2, [0.4] * 2]
+    assert disk.shaped("box").coefficients.tolist() == [
+        [0, 0],
+        [0, 0],
+        [0.5] * 2,
+        [0.3] * 2,
+        [0.4] * 2,
+    ]
     two = lv.Cones.contacts([(0.1, 0.2), (0.3, 0.3)], shape="box")
     assert two.shaped("disk").kind.tolist() == [lv.CONTACT_ELLIPSE, lv.CONTACT]
     assert two.shaped("disk").shaped("box") == two
@@ -62,7 +74,9 @@ def test_findex_round_trip_in_any_order_is_equal(seed):
     np.testing.assert_array_equal(named, given_[rows])
     for kind, unread in ((np.int64, np.nan), (np.float32, 2.0)):
         low3 = np.where(findex < 0, low2, unread)
-        again = lv.Problem.from_findex(a2, b2, low3, high2, findex.astype(kind), guess=problem.guess)
+        again = lv.Problem.from_findex(
+            a2, b2, low3, high2, findex.astype(kind), guess=problem.guess
+        )
         assert again == problem
 
 
@@ -94,10 +108,14 @@ def test_cones_of_two_coefficients_return_them_and_equal_ones_are_a_disk():
     assert not cones.is_polyhedral
     np.testing.assert_allclose(cones.coefficients, mu, rtol=1e-15)
     np.testing.assert_allclose(cones.friction_coefficient.reshape(-1, 3)[:, 1:], mu, rtol=1e-15)
-    np.testing.assert_allclose(cones.stretch.reshape(-1, 3)[:2], [[1, 1, 0.4], [1, 0.025, 1]], rtol=1e-15)
+    np.testing.assert_allclose(
+        cones.stretch.reshape(-1, 3)[:2], [[1, 1, 0.4], [1, 0.025, 1]], rtol=1e-15
+    )
     assert lv.Cones.contacts([(0.5, 0.5), (0.0, 0.0)]) == lv.Cones.contacts([0.5, 0.0])
     assert (lv.Cones.free(2) + cones).has_ellipse
-    assert lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.5)]).disk.cones.kind.tolist() == [lv.CONTACT]
+    assert lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.5)]).disk.cones.kind.tolist() == [
+        lv.CONTACT
+    ]
     x = np.array([1.0, 3.0, 4.0, 1.0, 0.0, 0.1, 1.0, 0.3, 0.0, -1.0, 1.0, 1.0])
     t = lv.cones.project_impulse(cones, x).reshape(-1, 3)
     np.testing.assert_allclose(np.hypot(*(t[0, 1:] / mu[0])), 1.0)
@@ -128,7 +146,9 @@ def test_converted_ellipses_share_the_factor_of_the_mass_matrix(mass):
     assert disk.generalized.change(x).tobytes() == anew.change(x).tobytes()
     assert (
         disk.metric.whitened()[2].tobytes()
-        == lv.Problem(disk.b, disk.cones, generalized=anew, compliance=disk.compliance).metric.whitened()[2].tobytes()
+        == lv.Problem(disk.b, disk.cones, generalized=anew, compliance=disk.compliance)
+        .metric.whitened()[2]
+        .tobytes()
     )
 
 
@@ -149,9 +169,17 @@ def test_solution_of_ellipses_is_in_the_given_rows(form):
     problem = ELLIPSES[form](3, friction="cone")
     s = problem.cones.stretch
     calls = []
-    found = lv.solve(problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None)
+    found = lv.solve(
+        problem,
+        "anderson",
+        tol=1e-6,
+        max_iter=5,
+        callback=lambda n, x, r: calls.append((x, r)) and None,
+    )
     r = lv.residual(problem, found.impulse)
-    np.testing.assert_allclose(found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12
+    )
     np.testing.assert_allclose(found.residual.error, r.error, rtol=1e-9, atol=1e-12)
     assert found.residual.relative == pytest.approx(r.relative, rel=1e-9)
     for x, at in calls:
@@ -167,6 +195,8 @@ def test_solution_of_ellipses_is_in_the_given_rows(form):
     p = problem.disk
     assert not p.cones.has_ellipse
     assert p.disk is p
-    assert lv.residual(p, problem.on_disk(found.impulse)).relative == pytest.approx(r.relative, rel=1e-12)
+    assert lv.residual(p, problem.on_disk(found.impulse)).relative == pytest.approx(
+        r.relative, rel=1e-12
+    )
     np.testing.assert_allclose(p.dense(), s[:, None] * problem.dense() * s, rtol=1e-12)
     assert problem.row_name(r.worst_row) == r.worst_name == p.row_name(r.worst_row)

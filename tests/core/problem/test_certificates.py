@@ -48,7 +48,9 @@ def test_infeasible_message_names_the_proof(name):
         solution = lv.solve(opposed(eps), name)
         assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
         assert (solution.impulse_bound == np.inf) is (eps == 0.0)
-        assert eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0  # the sum of (2 / eps + 1, 2 / eps)
+        assert (
+            eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0
+        )  # the sum of (2 / eps + 1, 2 / eps)
         assert words in solution.message
     assert lv.solve(opposed(1.0), name).impulse_bound is None
 
@@ -91,7 +93,9 @@ def test_infeasible_is_claimed_of_rigid_and_not_of_soft_rows(law, form):
             solution = lv.solve(problem, name, max_iter=200)
             assert solution.claim_check == "confirmed" and not solution.success
             if solution.status is lv.Status.INFEASIBLE:
-                assert solution.impulse_bound == np.inf and "no solution, proved" in solution.message
+                assert (
+                    solution.impulse_bound == np.inf and "no solution, proved" in solution.message
+                )
     assert lv.solve(held(law, 0.0, form)).status is lv.Status.INFEASIBLE
 
 
@@ -109,7 +113,9 @@ def test_infeasible_rigid_rows_among_soft_ones_are_found(seed, form):
     jac[:, 0], jac[:, 6] = 1.0, -1.0
     bodies = np.full(n, 1e3), np.tile(1e3 * np.eye(3), (n, 1, 1)), np.zeros((n, 6))
     rows = lv.Rows(*bodies, jac=jac, joint_ptr=np.arange(m + 1, dtype=np.int32), joint_body=pair)
-    problem = lv.Problem.from_rows(rows, target=target, lower=lower, upper=np.inf, compliance=soft, mu=0.0)
+    problem = lv.Problem.from_rows(
+        rows, target=target, lower=lower, upper=np.inf, compliance=soft, mu=0.0
+    )
     solution = lv.solve(FORMS[form](problem))
 
     j = np.zeros((m, n))
@@ -118,8 +124,17 @@ def test_infeasible_rigid_rows_among_soft_ones_are_found(seed, form):
     rigid = soft == 0.0
     one = rigid & free
     below = rigid & ~free
-    met = linprog(np.zeros(n), A_ub=-j[below], b_ub=-target[below], A_eq=j[one], b_eq=target[one], bounds=(None, None))
-    assert solution.status is (lv.Status.CONVERGED if met.success else lv.Status.INFEASIBLE), str(solution)
+    met = linprog(
+        np.zeros(n),
+        A_ub=-j[below],
+        b_ub=-target[below],
+        A_eq=j[one],
+        b_eq=target[one],
+        bounds=(None, None),
+    )
+    assert solution.status is (lv.Status.CONVERGED if met.success else lv.Status.INFEASIBLE), str(
+        solution
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -137,7 +152,9 @@ def test_impulse_bound_holds_for_every_solution(law, form):
         for _ in range(10):
             y = np.zeros(problem.m)
             c = problem.cones
-            y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (rng.random(len(c.normal_rows)) < 0.5)
+            y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (
+                rng.random(len(c.normal_rows)) < 0.5
+            )
             free = np.isneginf(c.lower) & np.isposinf(c.upper) & ~c.contact_rows
             y[free] = rng.normal(size=free.sum())
             found = prove_infeasibility(problem, y)
@@ -166,7 +183,12 @@ def walking(seed, dust=2.78e-17):
 def test_certificate_with_noise_on_a_soft_row_proves_without_that_row(noise):
     """Two rigid rows of one velocity contradict each other; every certificate is 0 on a soft row."""
     problem = lv.Problem.from_jacobian(
-        np.ones((3, 1)), [[2.0]], [0.0], target=[0.0, 1.0, 0.5], cones=lv.Cones.free(3), compliance=[0.0, 0.0, 0.1]
+        np.ones((3, 1)),
+        [[2.0]],
+        [0.0],
+        target=[0.0, 1.0, 0.5],
+        cones=lv.Cones.free(3),
+        compliance=[0.0, 0.0, 0.1],
     )
     assert check_certificate(problem, [-1.0, 1.0, noise]) is None
 
@@ -175,7 +197,10 @@ def test_format_lower_bound_has_one_digit_and_is_never_above_the_bound():
     rng = np.random.default_rng(0)
     for bound in (*10.0 ** rng.uniform(-30.0, 30.0, 200), 9.999, 1.0, 0.95, 1e22):
         text = format_lower_bound(bound)
-        assert 0.5 * bound < float(text) <= bound and float(text) == float(f"{float(text):.0e}"), (bound, text)
+        assert 0.5 * bound < float(text) <= bound and float(text) == float(f"{float(text):.0e}"), (
+            bound,
+            text,
+        )
 
 
 def test_proof_names_the_rows_and_the_contacts_that_contradict():
@@ -183,10 +208,17 @@ def test_proof_names_the_rows_and_the_contacts_that_contradict():
     jac = np.zeros((8, 4))
     jac[[0, 1, 2, 3, 4, 5, 6, 7], [0, 1, 0, 2, 3, 2, 0, 1]] = 1.0
     problem = lv.Problem.from_jacobian(
-        jac, np.eye(4), np.zeros(4), target=np.eye(8)[2], cones=lv.Cones.free(2) + lv.Cones.contacts(0.5, count=2)
+        jac,
+        np.eye(4),
+        np.zeros(4),
+        target=np.eye(8)[2],
+        cones=lv.Cones.free(2) + lv.Cones.contacts(0.5, count=2),
     )
     proof = prove_infeasibility(problem, -np.eye(8)[0] + np.eye(8)[2])
-    assert (proof.impulse_bound, proof.message) == (np.inf, "no solution, proved: row 0 against contact 0")
+    assert (proof.impulse_bound, proof.message) == (
+        np.inf,
+        "no solution, proved: row 0 against contact 0",
+    )
     assert list_conflicting_blocks(problem, proof.y) == ((0,), (2,))
 
 
@@ -200,11 +232,18 @@ def test_auto_proves_that_opposed_contacts_contradict_in_any_island(law, mu, pla
     b = np.tile([0.5, 0.1, 0.2, -0.6, 0.1, 0.0], 3)
     b[6 * place : 6 * place + 6] = [1.0, 0.1, 0.2, 0.5, 0.1, 0.0]
     whole = lv.Problem.from_jacobian(
-        sp.block_diag([jac] * 3), np.eye(9), np.zeros(9), target=b, cones=lv.Cones.contacts(mu, count=6), friction=law
+        sp.block_diag([jac] * 3),
+        np.eye(9),
+        np.zeros(9),
+        target=b,
+        cones=lv.Cones.contacts(mu, count=6),
+        friction=law,
     )
     for problem in (whole, as_matrix(whole)):
         solution = lv.solve(problem)
-        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(solution)
+        assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed", str(
+            solution
+        )
         assert set(np.flatnonzero(solution.certificate)) <= set(range(6 * place, 6 * place + 6))
 
 
@@ -216,13 +255,17 @@ def test_row_of_rounding_size_needs_no_impulse(form, name):
         problem = as_matrix(dusty) if form == "matrix" else dusty
         assert len(problem.metric.empty) and problem.b[0] > 0.0
         solution = lv.solve(problem, name, tol=1e-6)
-        clean = lv.solve(problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6)
+        clean = lv.solve(
+            problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6
+        )
         assert solution.success == clean.success, str(solution)
         assert solution.claim_check == "confirmed"
         if form == "J and M" and name in OURS:  # nor to any tolerance
             assert lv.solve(problem, name, tol=1e-20).status is not lv.Status.INFEASIBLE
     real = walking(0, dust=1e-3)
-    assert lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
+    assert (
+        lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
+    )
 
 
 def test_empty_row_of_bodies_of_rounding_size_needs_no_impulse():
@@ -232,7 +275,9 @@ def test_empty_row_of_bodies_of_rounding_size_needs_no_impulse():
     for form in (lambda p: p, as_matrix, general):
         for dust, status in ((1e-17, "CONVERGED"), (1e-2, "INFEASIBLE")):
             target = np.zeros(len(jac) + rows.n_contacts)
-            given = lv.Rows(**{f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "jac"}, jac=jac)
+            given = lv.Rows(
+                **{f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "jac"}, jac=jac
+            )
             target[0] = dust
             problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
             assert lv.solve(problem).status.name == status

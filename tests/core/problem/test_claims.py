@@ -34,7 +34,10 @@ ANEW = {
 
 def test_solver_without_progress_is_stopped_as_stalled(plug_in):
     name = plug_in(
-        lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0), resumable=True
+        lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(
+            lv.Status.MAX_ITERATIONS, 0
+        ),
+        resumable=True,
     )
     solution = lv.solve(random_lcp(5), name, max_iter=10**9)
     assert solution.status is lv.Status.STALLED
@@ -79,7 +82,11 @@ def test_infeasible_rows_leave_impulses_of_other_rows(plug_in):
     """The largest velocity error is that of rows that cannot be met; it chose the zero impulse for all."""
 
     def run(problem, impulse):
-        impulse[:] = [*np.full(10, 0.1), 0.0, 0.1]  # the last two rows are off by 1.1 and 0.9, 1 each at rest
+        impulse[:] = [
+            *np.full(10, 0.1),
+            0.0,
+            0.1,
+        ]  # the last two rows are off by 1.1 and 0.9, 1 each at rest
         return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.array([*np.zeros(10), 1.0, 1.0]))
 
     contradicting = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -91,12 +98,19 @@ def test_infeasible_rows_leave_impulses_of_other_rows(plug_in):
 
 def test_lemke_ray_on_a_solvable_problem_is_stalled():
     """A solution of at most 0.2 N s exists: a small lower bound on all solutions does not mean contradicting rows."""
-    m = [[0.0, 0.0, 30.0, 25.0], [0.0, 0.0, 10.0, 5.0], [25.0, 25.0, 0.0, 0.0], [15.0, 5.0, 0.0, 0.0]]
+    m = [
+        [0.0, 0.0, 30.0, 25.0],
+        [0.0, 0.0, 10.0, 5.0],
+        [25.0, 25.0, 0.0, 0.0],
+        [15.0, 5.0, 0.0, 0.0],
+    ]
     problem = lv.Problem.lcp(m, np.ones(4))
     lost = lv.solve(problem, "lemke")
     assert lost.status is lv.Status.STALLED and lv.solve(problem).success
     assert "secondary ray" in lost.message and "at least" not in lost.message
-    nearly = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1e-6]], [1.0, 1.0]), "pgs", max_iter=100)
+    nearly = lv.solve(
+        lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1e-6]], [1.0, 1.0]), "pgs", max_iter=100
+    )
     assert nearly.impulse_bound is None or "at least" in nearly.message
 
 
@@ -139,13 +153,20 @@ def test_false_claim_in_every_form_and_law_is_contradicted(form, status, plug_in
                 impulse[:] = told
                 return says(status)
 
-            liar = plug_in(run, operators={"matrix"}, supports_rolling=True, box_friction_laws={"coulomb", "cone"})
+            liar = plug_in(
+                run,
+                operators={"matrix"},
+                supports_rolling=True,
+                box_friction_laws={"coulomb", "cone"},
+            )
             solution = lv.solve(problem, liar)
             assert solution.claim_check == "contradicted", (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}
 
 
-HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range
+HIDDEN = lv.Problem.lcp(
+    [[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf]
+)  # b is not in A's range
 
 
 def along(ray, b, mu):
@@ -155,7 +176,9 @@ def along(ray, b, mu):
 
 RUNAWAYS = {
     "b is not in the range of A": HIDDEN,
-    "sweeps run away until A lambda - b rounds to 0": along([-0.1, 2.6, 0.7, 1.4], [1.5, 0.0, -1.6, -0.1], [0.8, 0.5]),
+    "sweeps run away until A lambda - b rounds to 0": along(
+        [-0.1, 2.6, 0.7, 1.4], [1.5, 0.0, -1.6, -0.1], [0.8, 0.5]
+    ),
     "every row pulls": along([-0.2, -0.7, 0.6, 2.0], [0.2, -1.1, 1.4, -1.9], [0.3, 0.6]),
 }
 
@@ -165,9 +188,17 @@ RUNAWAYS = {
 def test_unsolvable_problem_with_growing_impulses_is_not_accepted(name, problem):
     if registry.get(name).refuses(problem) is not None:
         return
-    for budget in ({}, {"tol": 1e-9}, {"max_iter": 20_000}):  # one that was used up in vain asks for a proof, too
+    for budget in (
+        {},
+        {"tol": 1e-9},
+        {"max_iter": 20_000},
+    ):  # one that was used up in vain asks for a proof, too
         solution = lv.solve(problem, name, **budget)
-        assert not solution.success and solution.claim_check == "confirmed" and not solution.residual.at_floor
+        assert (
+            not solution.success
+            and solution.claim_check == "confirmed"
+            and not solution.residual.at_floor
+        )
         assert solution.status not in (lv.Status.ROUNDOFF_LIMIT, lv.Status.CONVERGED)
         if solution.status is not lv.Status.INFEASIBLE:
             with pytest.raises(lv.errors.SolveFailed):

@@ -9,8 +9,12 @@ import lavender as lv
 def moved(mass, v, *, target=0.0, compliance=0.0, lower=-np.inf, upper=np.inf):
     """Velocity after a step of what moves along one row: a row of docs/c.md's table of fields."""
     cones = lv.Cones.bounded(np.array([lower]), np.array([upper]))
-    problem = lv.Problem.from_jacobian([[1.0]], [[mass]], [v], target=target, cones=cones, compliance=compliance)
-    return problem.generalized.velocity_of(problem.velocity(lv.solve(problem, tol=1e-12).impulse)).item()
+    problem = lv.Problem.from_jacobian(
+        [[1.0]], [[mass]], [v], target=target, cones=cones, compliance=compliance
+    )
+    return problem.generalized.velocity_of(
+        problem.velocity(lv.solve(problem, tol=1e-12).impulse)
+    ).item()
 
 
 def test_fields_of_springs_motors_limits_and_gaps_have_their_documented_effect():
@@ -26,14 +30,20 @@ def test_fields_of_springs_motors_limits_and_gaps_have_their_documented_effect()
         force = rng.uniform(0, 30)
         spring = moved(m, v, compliance=1.0 / (h * (h * k + c)), target=-k * error / (h * k + c))
         # m (v+ - v) = -h (k (C + h v+) + c v+)
-        assert spring == pytest.approx((m * v - h * k * error) / (m + h * (h * k + c)), rel=1e-9, abs=1e-9)
+        assert spring == pytest.approx(
+            (m * v - h * k * error) / (m + h * (h * k + c)), rel=1e-9, abs=1e-9
+        )
         motor = moved(m, v, target=2.0, lower=-h * force, upper=h * force)
         assert motor == pytest.approx(v + np.clip(2.0 - v, -h * force / m, h * force / m), abs=1e-9)
         dry = moved(m, v, lower=-h * force, upper=h * force)
         assert dry == pytest.approx(np.sign(v) * max(0.0, abs(v) - h * force / m), abs=1e-9)
-        assert moved(m, v, target=-0.3 * error / h) == pytest.approx(-0.3 * error / h)  # a joint, beta 0.3
+        assert moved(m, v, target=-0.3 * error / h) == pytest.approx(
+            -0.3 * error / h
+        )  # a joint, beta 0.3
         gap = abs(error) * h
-        assert gap + h * moved(m, v, target=-gap / h, lower=0.0) == pytest.approx(max(0.0, gap + h * v), abs=1e-9)
+        assert gap + h * moved(m, v, target=-gap / h, lower=0.0) == pytest.approx(
+            max(0.0, gap + h * v), abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("belt_is_a", [True, False])

@@ -67,7 +67,8 @@ def test_projection_is_feasible_idempotent_and_nearest(seed, size):
 def test_faults_of_blocks_have_one_message_for_arrays_and_lists(name, at, value, words):
     cones = lv.Cones.bounded([-np.inf], [2.0]) + lv.Cones.contacts(0.5, 2, 0.1)
     fields = {
-        n: np.array(getattr(cones, n)) for n in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
+        n: np.array(getattr(cones, n))
+        for n in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
     }
     fields[name][at] = value
     messages = []

@@ -6,7 +6,14 @@ import scipy.sparse as sp
 from calls import robot
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, random_lcp, random_tree_parents, seeds, side_by_side, tree_mass
+from random_problems import (
+    random_contact_problem,
+    random_lcp,
+    random_tree_parents,
+    seeds,
+    side_by_side,
+    tree_mass,
+)
 
 import lavender as lv
 from lavender.judge.residuals import UNIT_ROUNDOFF_FLOAT32, estimate_float32_slack_errors
@@ -25,7 +32,13 @@ def dense_parts(p):
 @pytest.mark.parametrize("form", ["rows", "matrix", "generalized"])
 @given(seed=seeds)
 def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
-    p = random_contact_problem(seed) if form == "rows" else robot(seed) if form == "generalized" else random_lcp(seed)
+    p = (
+        random_contact_problem(seed)
+        if form == "rows"
+        else robot(seed)
+        if form == "generalized"
+        else random_lcp(seed)
+    )
     lam = lv.solve(p, max_iter=50).impulse
     if form == "matrix":
         a = p.dense()
@@ -37,7 +50,9 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
         x = inverse @ jac.T @ lam
         pushed = jac.T**2 @ lam**2
         through = (jac @ inverse) ** 2
-        rounded_mass = jac**2 @ inverse**2 @ (jac.T @ lam) ** 2 if mass is None else through @ mass**2 @ x**2
+        rounded_mass = (
+            jac**2 @ inverse**2 @ (jac.T @ lam) ** 2 if mass is None else through @ mass**2 @ x**2
+        )
         own = a**2 @ lam**2
         b2 = (p.b + jac @ free) ** 2 + 2 * jac**2 @ free**2
         data = jac**2 @ x**2 + through @ pushed + rounded_mass + p.compliance**2 * lam**2 + b2
@@ -46,7 +61,9 @@ def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
             acts = (lam != p.cones.lower) & (lam != p.cones.upper) & (lam != 0.0)
             seen = jac**2 @ x**2 + p.b**2 + p.compliance**2 * lam**2
             velocities = a**2 @ np.where(acts, seen / p.compliance**2, 0.0)
-    for got, want in zip(estimate_float32_slack_errors(p, lam), (own, data, velocities), strict=True):
+    for got, want in zip(
+        estimate_float32_slack_errors(p, lam), (own, data, velocities), strict=True
+    ):
         np.testing.assert_allclose(got, UNIT_ROUNDOFF_FLOAT32**2 * want, rtol=1e-9, atol=1e-30)
 
 
@@ -55,9 +72,14 @@ def test_the_residual_above_the_floor_does_not_depend_on_the_order_of_islands(se
     parts = [random_lcp(seed), random_lcp(seed + 1)]
     impulses = [off * lv.solve(parts[0]).impulse, 0.9 * lv.solve(parts[1]).impulse]
     one, other = (
-        lv.residual(side_by_side(parts[::k]), np.concatenate(impulses[::k]), precision="float32") for k in (1, -1)
+        lv.residual(side_by_side(parts[::k]), np.concatenate(impulses[::k]), precision="float32")
+        for k in (1, -1)
     )
-    assert (one.verdict, one.relative, one.above_floor) == (other.verdict, other.relative, other.above_floor)
+    assert (one.verdict, one.relative, one.above_floor) == (
+        other.verdict,
+        other.relative,
+        other.above_floor,
+    )
     assert one.above_floor > 0.0
 
 
@@ -91,7 +113,12 @@ def test_jacobian_in_float32_is_widened_exactly():
     mass = p.generalized.mass.toarray()
     v = p.generalized.v_free
     for j, m, free, precision in (
-        (jac.astype(np.float32), sp.csr_array(mass.astype(np.float32)), v.astype(np.float32), "float32"),
+        (
+            jac.astype(np.float32),
+            sp.csr_array(mass.astype(np.float32)),
+            v.astype(np.float32),
+            "float32",
+        ),
         (jac.astype(np.float32), [mass.astype(np.float32)], v.astype(np.float32), "float32"),
         (jac, mass.astype(np.float32), v.astype(np.float32), "float64"),
         (jac.astype(np.float32), mass.astype(np.float32), v.tolist(), "float64"),

@@ -9,7 +9,13 @@ import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import as_matrix, random_generalized_problem, random_tree_parents, seeds, tree_mass
+from random_problems import (
+    as_matrix,
+    random_generalized_problem,
+    random_tree_parents,
+    seeds,
+    tree_mass,
+)
 
 import lavender as lv
 
@@ -38,7 +44,9 @@ def test_generalized_elimination_of_rows_together_has_the_bits_of_single_ones(se
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 48 if seed % 5 else 160))
     parent = np.arange(n) - 1 if seed % 3 == 0 else random_tree_parents(rng, n)
-    mass = tree_mass(rng, parent) + 0.1 * np.eye(n)  # long chains alone lose definiteness to rounding
+    mass = tree_mass(rng, parent) + 0.1 * np.eye(
+        n
+    )  # long chains alone lose definiteness to rounding
     if seed % 4 == 1:  # fills in
         for i, j in rng.integers(0, n, (int(rng.integers(1, n + 1)), 2)):
             mass[[i, j], [j, i]] += 1e-3
@@ -47,7 +55,10 @@ def test_generalized_elimination_of_rows_together_has_the_bits_of_single_ones(se
     x = rng.normal(size=n)
     general = lv.Generalized(np.ones((1, n)), mass, np.zeros(n))
     order = np.arange(n) if general.order is None else general.order
-    assert general.solve(x)[order].tobytes() == row_by_row(mass[np.ix_(order, order)], x[order]).tobytes()
+    assert (
+        general.solve(x)[order].tobytes()
+        == row_by_row(mass[np.ix_(order, order)], x[order]).tobytes()
+    )
 
 
 def test_from_jacobian_of_any_matrix_type_gives_one_problem():
@@ -79,8 +90,12 @@ def test_from_jacobian_without_rows_or_velocities_is_solved():
     bounds = lv.Cones.bounded(np.zeros(2), np.full(2, 4.0))
     empty = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=bounds)
     solution = lv.solve(empty, "newton", tol=1e-12)
-    np.testing.assert_allclose(solution.impulse, [1.0, 4.0])  # the row on nothing: decided on the spot
-    hopeless = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2))
+    np.testing.assert_allclose(
+        solution.impulse, [1.0, 4.0]
+    )  # the row on nothing: decided on the spot
+    hopeless = lv.Problem.from_jacobian(
+        jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2)
+    )
     assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
 
 
@@ -95,9 +110,14 @@ def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
     if soft and friction == "coulomb":  # rows of A go on where velocities stall
         assert lv.solve(problem, "newton", tol=tol).success
     elif friction == "cone":
-        assert solution.residual.relative <= max(tol, 2 * solution.residual.roundoff_floor), str(solution)
+        assert solution.residual.relative <= max(tol, 2 * solution.residual.roundoff_floor), str(
+            solution
+        )
     assert solution.claim_check == "confirmed"
-    assert solution.solver.form in ("generalized coordinates", "velocity")  # "velocity" if J and M describe free bodies
+    assert solution.solver.form in (
+        "generalized coordinates",
+        "velocity",
+    )  # "velocity" if J and M describe free bodies
 
 
 def test_problem_updated_has_the_same_structure_and_new_numbers():
@@ -122,7 +142,9 @@ def test_problem_updated_has_the_same_structure_and_new_numbers():
     assert problem.updated(b=problem.b) == problem
 
 
-@pytest.mark.parametrize("jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]])
+@pytest.mark.parametrize(
+    "jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
+)
 def test_generalized_matrix_leaves_out_vanishing_entries(jac):
     """Colours and islands are told by entries: of rows that all meet in the same columns, and of others."""
     n = len(jac)
@@ -135,13 +157,17 @@ def test_generalized_matrix_leaves_out_vanishing_entries(jac):
 def test_generalized_factor_of_a_tree_has_the_pattern_of_its_branches(friction, seed):
     """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
     contacts = 0 if friction == "lcp" else 6
-    problem = random_generalized_problem(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
+    problem = random_generalized_problem(
+        seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts
+    )
     solution = lv.solve(problem, "newton", form="velocity", tol=1e-11)
     assert solution.residual.relative <= 1e-11 or solution.residual.at_floor
     other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
     # Every row is soft by 0.01 / kg or more, so residuals of 1e-11 are impulses of 1e-8 of their size.
     if friction != "coulomb":
-        np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max()))
+        np.testing.assert_allclose(
+            solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max())
+        )
 
 
 @pytest.mark.parametrize(
@@ -164,15 +190,23 @@ def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, comp
     jac[first, 7:] = jac[~first, :7] = 0.0
     mass = scipy.linalg.block_diag(*(half @ half.swapaxes(1, 2) + np.eye(7)))
     v_free = rng.normal(size=14)
-    problem = lv.Problem.from_jacobian(jac, mass, v_free, cones=cones, compliance=compliance, friction="cone")
+    problem = lv.Problem.from_jacobian(
+        jac, mass, v_free, cones=cones, compliance=compliance, friction="cone"
+    )
     start = rng.uniform(0.0, 1.0, m)
     whole = lv.solve(problem, "newton", form="velocity", impulse=start, tol=1e-9)
     assert whole.success
     apart = lv.solve(problem, other, tol=1e-9)
-    np.testing.assert_allclose(problem.velocity(whole.impulse), problem.velocity(apart.impulse), atol=1e-6)
+    np.testing.assert_allclose(
+        problem.velocity(whole.impulse), problem.velocity(apart.impulse), atol=1e-6
+    )
 
 
-@given(pairs=st.lists(st.lists(st.integers(0, 8), min_size=2, max_size=2, unique=True), min_size=1, max_size=6))
+@given(
+    pairs=st.lists(
+        st.lists(st.integers(0, 8), min_size=2, max_size=2, unique=True), min_size=1, max_size=6
+    )
+)
 def test_islands_of_rows_between_trees_are_the_components_of_the_matrix(pairs):
     first, second = np.array(pairs).T
     jac = np.eye(9)[first] - np.eye(9)[second]
@@ -221,4 +255,6 @@ def test_generalized_order_of_many_small_trees_fills_in_little(seed):
     np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7)
     v = problem.velocity(solution.impulse)
     given = problem.generalized
-    np.testing.assert_allclose(given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11)
+    np.testing.assert_allclose(
+        given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11
+    )

@@ -44,7 +44,16 @@ def rows_side_by_side(first, second):
     rows = lv.Rows(
         **{
             name: np.concatenate([getattr(p, name), getattr(q, name)])
-            for name in ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")
+            for name in (
+                "inv_mass",
+                "inv_inertia",
+                "v_free",
+                "jac",
+                "normal",
+                "tangent",
+                "arm_a",
+                "arm_b",
+            )
         },
         joint_ptr=np.concatenate([p.joint_ptr, p.joint_ptr[-1] + q.joint_ptr[1:]]).astype(np.int32),
         joint_body=np.concatenate([p.joint_body, shifted(q.joint_body)]),
@@ -52,12 +61,18 @@ def rows_side_by_side(first, second):
     )
     j, k, c, d = p.n_joints, q.n_joints, p.n_contacts, q.n_contacts
     cones = first.cones + second.cones
-    order = np.concatenate([np.arange(j), j + c + np.arange(k), j + np.arange(c), j + c + k + np.arange(d)]).astype(int)
+    order = np.concatenate(
+        [np.arange(j), j + c + np.arange(k), j + np.arange(c), j + c + k + np.arange(d)]
+    ).astype(int)
     size = np.diff(cones.ptr)
-    row_order = np.concatenate([np.arange(cones.ptr[i], cones.ptr[i] + size[i]) for i in order]).astype(int)
+    row_order = np.concatenate(
+        [np.arange(cones.ptr[i], cones.ptr[i] + size[i]) for i in order]
+    ).astype(int)
     b = np.concatenate([first.b, second.b])[row_order]
     compliance = np.concatenate([first.compliance, second.compliance])[row_order]
-    both = lv.Problem(b, cones.select(order), rows=rows, compliance=compliance, friction=first.friction)
+    both = lv.Problem(
+        b, cones.select(order), rows=rows, compliance=compliance, friction=first.friction
+    )
     return both, row_order
 
 
@@ -95,8 +110,13 @@ def scaled(problem, factor):
 @pytest.mark.parametrize("kind", CONTACTS)
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds, power=st.integers(-6, 6))
-def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind, friction, seed, power):
-    first, second = (FORMS[form](CONTACTS[kind](seed + i, friction, bodies=3, joints=2, contacts=3)) for i in range(2))
+def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(
+    form, kind, friction, seed, power
+):
+    first, second = (
+        FORMS[form](CONTACTS[kind](seed + i, friction, bodies=3, joints=2, contacts=3))
+        for i in range(2)
+    )
     second = scaled(second, 10.0**power)
     both, rows = together(first, second)
     rng = np.random.default_rng(seed)
@@ -146,7 +166,9 @@ def with_inactive_rows(problem, rng, sizes):
     return more.updated(b=np.concatenate([problem.b, b]))
 
 
-LARGE = st.lists(st.integers(3, 60), min_size=1, max_size=3).map(lambda powers: 10.0 ** np.array(powers))
+LARGE = st.lists(st.integers(3, 60), min_size=1, max_size=3).map(
+    lambda powers: 10.0 ** np.array(powers)
+)
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -163,7 +185,9 @@ def test_residual_relative_does_not_depend_on_inactive_rows(form, friction, seed
     for impulse in (lam, problem.start(), lv.solve(problem, tol=1e-9).impulse):
         alone = lv.residual(convert(problem), impulse)
         found = lv.residual(convert(more), np.concatenate([impulse, np.zeros(more.m - problem.m)]))
-        assert found.relative == pytest.approx(alone.relative, rel=1e-9, abs=4.0 * alone.roundoff_floor)
+        assert found.relative == pytest.approx(
+            alone.relative, rel=1e-9, abs=4.0 * alone.roundoff_floor
+        )
 
 
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
@@ -207,7 +231,9 @@ def unmoved_row_beside(b, form, target=1.0):
         return lv.Problem.lcp(np.array([[1.0, 0.1], [0.0, 0.0]]), [b, target])
     if form == "J and M":
         cones = lv.Cones.bounded([0.0, 0.0], [np.inf] * 2)
-        return lv.Problem.from_jacobian(np.diag([1.0, 0.0]), np.eye(2), [-b, 0.0], target=[0.0, target], cones=cones)
+        return lv.Problem.from_jacobian(
+            np.diag([1.0, 0.0]), np.eye(2), [-b, 0.0], target=[0.0, target], cones=cones
+        )
     rows = lv.Rows(
         inv_mass=[1.0, 0.0, 0.0],
         inv_inertia=[np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))],
@@ -223,12 +249,24 @@ def unmoved_row_beside(b, form, target=1.0):
 
 @pytest.mark.parametrize("form", ["A", "A, one block", "A, coupled", "J and M", "bodies"])
 def test_residual_row_that_no_impulse_moves_does_not_depend_on_other_rows(form):
-    for b, tol, target in ((1e6, 1e-6, 1.0), (1e9, 1e-8, 1.0), (1e9, 1e-3, 1e3), (1e-9, 1e-6, 1e-9), (1e3, 1e-3, 1.0)):
+    for b, tol, target in (
+        (1e6, 1e-6, 1.0),
+        (1e9, 1e-8, 1.0),
+        (1e9, 1e-3, 1e3),
+        (1e-9, 1e-6, 1e-9),
+        (1e3, 1e-3, 1.0),
+    ):
         problem = unmoved_row_beside(b, form, target)
-        worlds = [lv.solve(problem, "pgs" if form.startswith("A") else "auto", tol=tol), lv.solve(problem, tol=tol)]
+        worlds = [
+            lv.solve(problem, "pgs" if form.startswith("A") else "auto", tol=tol),
+            lv.solve(problem, tol=tol),
+        ]
         for solution in [*worlds, *lv.solve_many([problem] * 2, "newton", tol=tol)]:
             assert solution.status is lv.Status.INFEASIBLE and not solution.success, (form, b, tol)
-        assert worlds[1].claim_check == "confirmed" and problem.row_name(1).split(",")[0] in worlds[1].message
+        assert (
+            worlds[1].claim_check == "confirmed"
+            and problem.row_name(1).split(",")[0] in worlds[1].message
+        )
         assert worlds[1].residual.relative == pytest.approx(1.0, rel=1e-6)
         assert any(s.kind == "immovable" and s.blocks for s in lv.diagnose(problem))
 
@@ -254,7 +292,9 @@ def row_between_driven_bodies(speed, excess, lower, form):
 
 @pytest.mark.parametrize("form", ["bodies", "matrix"])
 @pytest.mark.parametrize("solver", ["auto", "newton", "pgs", "direct"])
-def test_row_between_driven_bodies_is_violated_by_the_velocity_that_its_bounds_do_not_allow(solver, form):
+def test_row_between_driven_bodies_is_violated_by_the_velocity_that_its_bounds_do_not_allow(
+    solver, form
+):
     for speed, excess in ((1e3, 1e-3), (1.0, 1e-3), (1e3, -1e-3), (1e5, 1e-6), (1e3, 0.0)):
         for lower in (-np.inf, 0.0):
             problem = row_between_driven_bodies(speed, excess, lower, form)
@@ -262,10 +302,17 @@ def test_row_between_driven_bodies_is_violated_by_the_velocity_that_its_bounds_d
                 pytest.skip("the solver takes another form")
             solution = lv.solve(problem, solver)
             is_met = excess == 0.0 or (lower == 0.0 and excess > 0.0)
-            assert solution.status is (lv.Status.CONVERGED if is_met else lv.Status.INFEASIBLE), str(solution)
-            assert solution.claim_check == "confirmed" and solution.impulse[1] == pytest.approx(-1.0)
+            assert solution.status is (lv.Status.CONVERGED if is_met else lv.Status.INFEASIBLE), (
+                str(solution)
+            )
+            assert solution.claim_check == "confirmed" and solution.impulse[1] == pytest.approx(
+                -1.0
+            )
             if is_met:
-                assert solution.residual.islands.relative[0] == 0.0 or solution.residual.relative < 1e-9
+                assert (
+                    solution.residual.islands.relative[0] == 0.0
+                    or solution.residual.relative < 1e-9
+                )
             else:
                 assert solution.residual.relative == 1.0
 
@@ -282,7 +329,10 @@ def test_residual_with_bodies_that_do_not_move_agrees_with_long_double():
                 continue
             n_unmoved += len(problem.metric.empty) > 0
             # 1e-5: a floor of up to twice the residual is in both judgements.
-            assert abs(found.relative - expected.relative) <= 1e-5 * expected.relative + expected.allowed, seed
+            assert (
+                abs(found.relative - expected.relative)
+                <= 1e-5 * expected.relative + expected.allowed
+            ), seed
     assert n_unmoved > 20
 
 
@@ -290,7 +340,9 @@ def test_residual_row_with_zero_b_at_rest_is_compared_with_its_own_terms():
     """Row 1 is at rest; an impulse of 0.5 N s on it moves it by 0.5 m/s, however large b of row 0 is."""
     assert not lv.residual(lv.Problem.lcp(np.eye(2), [1e9, 0.0]), [1e9, 0.5]).relative <= 1.0
     cones = lv.Cones.bounded([-np.inf] * 2, [np.inf] * 2)
-    rolls = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [-1e9, 3.0], target=[0.0, 3.0], cones=cones)
+    rolls = lv.Problem.from_jacobian(
+        np.eye(2), np.eye(2), [-1e9, 3.0], target=[0.0, 3.0], cones=cones
+    )
     # |target| + |J v*| is 6 m/s.
     assert lv.residual(rolls, [1e9, 0.5]).relative == pytest.approx(0.5 / 6.0)
     assert lv.solve(rolls, tol=1e-9).success
@@ -298,7 +350,9 @@ def test_residual_row_with_zero_b_at_rest_is_compared_with_its_own_terms():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(seed):
-    first, second = (random_contact_problem(seed + i, bodies=3, joints=2, contacts=4) for i in (0, 7))
+    first, second = (
+        random_contact_problem(seed + i, bodies=3, joints=2, contacts=4) for i in (0, 7)
+    )
     both, _ = rows_side_by_side(first, scaled(second, 1000.0))
     given = with_ground_as_body(both)
     count, label = find_islands(both)
@@ -310,13 +364,17 @@ def test_find_islands_ground_given_as_immovable_body_equals_ground_minus_one(see
         assert found[0] == count
         np.testing.assert_array_equal(found[1], label)
     np.testing.assert_array_equal(compute_block_colors(given), compute_block_colors(both))
-    np.testing.assert_array_equal(compute_block_levels_from_ground(given), compute_block_levels_from_ground(both))
+    np.testing.assert_array_equal(
+        compute_block_levels_from_ground(given), compute_block_levels_from_ground(both)
+    )
     lam = np.random.default_rng(seed).normal(size=both.m)
     assert lv.residual(given, lam).relative == lv.residual(both, lam).relative
     for name in ("pgs", "sequential_impulses", "block_gauss_seidel", "newton", "auto"):
         one, other = (lv.solve(p, name, tol=1e-8) for p in (both, given))
         assert one.status is other.status, name
-        np.testing.assert_allclose(lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative)
+        np.testing.assert_allclose(
+            lv.residual(both, other.impulse).islands.relative, other.residual.islands.relative
+        )
 
 
 def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
@@ -327,7 +385,9 @@ def test_residual_rounding_of_moving_immovable_bodies_is_satisfied():
 
 
 def test_newton_block_between_two_immovable_bodies_is_an_island_of_its_own():
-    rows = touching([(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)])
+    rows = touching(
+        [(0, 1), (1, 2)], inv_mass=[0.0, 0.0, 1.0], inv_inertia=[np.zeros((3, 3))] * 2 + [np.eye(3)]
+    )
     problem = lv.Problem.from_rows(rows, target=[0.0, 0.0, 0.0, 1.0, 0.5, 0.0], mu=0.5)
     assert find_islands(problem) == (2, pytest.approx([0, 1]))
     for name in ("newton", "auto", "admm", "block_gauss_seidel"):

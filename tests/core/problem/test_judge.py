@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from judge_twin import spec_of
 from kkt_truth import parts
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_generalized_problem, seeds
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    as_matrix,
+    random_contact_problem,
+    random_generalized_problem,
+    seeds,
+)
 
 import lavender as lv
 from lavender.judge import residuals
@@ -28,7 +35,9 @@ def equals_the_twin(problem, lam):
     np.testing.assert_allclose(found.slack * twin.stretch, w, rtol=0, atol=close * size.max())
     np.testing.assert_allclose(found.error, twin.stretch * e, rtol=0, atol=1e-10 * np.abs(e).max())
     said = twin.judge(lam)
-    np.testing.assert_allclose([found.energy, found.velocity], [said.energy, said.velocity], rtol=1e-9)
+    np.testing.assert_allclose(
+        [found.energy, found.velocity], [said.energy, said.velocity], rtol=1e-9
+    )
     speeds = twin.speeds(e)
     assert speeds[found.worst_row] == pytest.approx(float(speeds.max()), rel=1e-9)
     for impulse in (lam, lv.solve(problem, tol=1e-9).impulse):
@@ -37,7 +46,11 @@ def equals_the_twin(problem, lam):
         first = min(said.unrefined, 0.1 * said.relative)  # of a pass that need not be refined
         assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed + first
         # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
-        assert 0.1 * found.roundoff_floor <= said.floors[max(found.worst_island, 0)] <= 100.0 * found.roundoff_floor
+        assert (
+            0.1 * found.roundoff_floor
+            <= said.floors[max(found.worst_island, 0)]
+            <= 100.0 * found.roundoff_floor
+        )
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -100,12 +113,16 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
     for form, given_by in FORMS.items():
         p = given_by(problem)
         atol = 1e-11 if form == "J and M" else 1e-13
-        np.testing.assert_allclose(p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max())
+        np.testing.assert_allclose(
+            p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max()
+        )
         np.testing.assert_allclose(p.dense(), a, atol=atol * np.abs(a).max())
         assert p.csr.has_canonical_format
         np.testing.assert_array_equal(p.dense(), p.dense().T)
         if form != "matrix":
-            np.testing.assert_allclose(p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol)
+            np.testing.assert_allclose(
+                p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol
+            )
             work = lam @ (jac @ free + 0.5 * (jac @ minv @ jac.T @ lam))
             size = np.abs(lam) @ (np.abs(jac) @ np.abs(free) + np.abs(a) @ np.abs(lam))
             assert p.energy_change(lam) == pytest.approx(work, abs=100 * atol * size)
@@ -117,7 +134,9 @@ def test_energy_change_is_the_difference_of_kinetic_energies(seed):
     problem = FORMS["J and M"](problem)
     lam = np.random.default_rng(seed).normal(size=problem.m)
     general = problem.generalized
-    before, after = (0.5 * v @ general.momentum_of(v) for v in (general.v_free, problem.velocity(lam)))
+    before, after = (
+        0.5 * v @ general.momentum_of(v) for v in (general.v_free, problem.velocity(lam))
+    )
     # Both energies are sums of a few dozen products, with a solve with M before them.
     assert problem.energy_change(lam) == pytest.approx(after - before, abs=1e-10 * (before + after))
 
@@ -134,7 +153,11 @@ def test_energy_change_of_a_solution_without_targets_is_not_positive(seed):
         compliance=problem.compliance,
     )
     solution = lv.solve(problem, tol=1e-9)
-    before = 0.5 * problem.generalized.v_free @ problem.generalized.momentum_of(problem.generalized.v_free)
+    before = (
+        0.5
+        * problem.generalized.v_free
+        @ problem.generalized.momentum_of(problem.generalized.v_free)
+    )
     assert solution.success and problem.energy_change(solution.impulse) <= 1e-8 * before
 
 
@@ -187,7 +210,9 @@ def test_certificate_check_equals_its_twin(kind, law, seed):
     if kind == "bounded rows":
         low = np.where(rng.random(8) < 0.5, 0.0, -np.inf)
         cones = lv.Cones.bounded(low, np.where(rng.random(8) < 0.8, np.inf, 5.0))
-        y = np.where(low == 0.0, np.abs(rng.normal(size=8)), rng.normal(size=8)) * (rng.random(8) < 0.7)
+        y = np.where(low == 0.0, np.abs(rng.normal(size=8)), rng.normal(size=8)) * (
+            rng.random(8) < 0.7
+        )
     else:
         normals = lv.Cones.contacts([0.0, 0.0], 0)
         made = kind != "normals" and CONTACTS[kind](seed, law, bodies=3, joints=0, contacts=2)
@@ -197,12 +222,20 @@ def test_certificate_check_equals_its_twin(kind, law, seed):
         y[cones.normal_rows] = rng.uniform(0.1, 1.0, 2)
         for i, (rows, _) in ((k, part) for k in range(2) for part in parts(cones, k)):
             way = rng.normal(size=len(rows))
-            y[rows] = share * y[cones.ptr[i]] * cones.friction_coefficient[rows] * way / np.linalg.norm(way)
+            y[rows] = (
+                share
+                * y[cones.ptr[i]]
+                * cones.friction_coefficient[rows]
+                * way
+                / np.linalg.norm(way)
+            )
     y = y * rng.choice([1.0, 1.0, 1.0, -1.0])
     m = len(y)
     g = rng.normal(size=(len(y), len(y)))
     off = rng.random() < 0.8
-    for _ in range(2):  # once leaves rounding of what was there, much of a row that y takes nearly all of
+    for _ in range(
+        2
+    ):  # once leaves rounding of what was there, much of a row that y takes nearly all of
         g -= np.outer(y, y @ g) / max(y @ y, 1e-9) * off
     b = rng.normal(size=m)
     b += y * (rng.choice([0.5, 0.5, -0.5]) - b @ y) / max(y @ y, 1e-9)
@@ -246,7 +279,9 @@ def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(frictio
     # A disk: both lambda_t and mu lambda_n are rounded. The projection on a cone rounds in five more operations.
     assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.roundoff_floor
     if friction == "coulomb":  # a wide cone's nearest point follows the tangents
-        off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
+        off = lv.residual(
+            problem, exact * [1.0, 1.0, 1.0 + 2.0**-46]
+        )  # by 64 units of the last place
         assert off.relative > 2.0 * off.roundoff_floor
 
 

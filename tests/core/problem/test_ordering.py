@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side, sweeps, touching
+from random_problems import (
+    as_matrix,
+    random_contact_problem,
+    random_lcp,
+    seeds,
+    side_by_side,
+    sweeps,
+    touching,
+)
 
 import lavender as lv
 from lavender.problem.ordering import (
@@ -65,8 +73,12 @@ def test_block_levels_count_from_the_ground():
     rows = touching(body[shuffled])
     problem = lv.Problem.from_rows(rows)
     np.testing.assert_array_equal(compute_block_levels_from_ground(problem), shuffled)
-    np.testing.assert_array_equal(shuffled[compute_block_order(problem, "bottom_up").blocks], np.arange(n))
-    np.testing.assert_array_equal(shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1])
+    np.testing.assert_array_equal(
+        shuffled[compute_block_order(problem, "bottom_up").blocks], np.arange(n)
+    )
+    np.testing.assert_array_equal(
+        shuffled[compute_block_order(problem, "top_down").blocks], np.arange(n)[::-1]
+    )
     matrix = as_matrix(problem)
     ground = np.flatnonzero(shuffled == 0)
     np.testing.assert_array_equal(compute_block_levels_from_ground(matrix, ground), shuffled)

@@ -70,7 +70,10 @@ def test_problem_rows_have_names():
     cone = lv.Problem(np.ones(6), lv.Cones.contacts(0.5, 5), np.eye(6), friction="cone")
     assert [cone.row_name(i) for i in (3, 4)] == ["contact 0, spin", "contact 0, roll 1"]
     named = lv.Problem(
-        problem.b, problem.cones, rows=problem.rows, names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8
+        problem.b,
+        problem.cones,
+        rows=problem.rows,
+        names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8,
     )
     wide = int(np.argmax(np.diff(problem.cones.ptr[: kj + 1]) > 1))
     assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
@@ -80,12 +83,16 @@ def test_problem_rows_have_names():
 
 def test_from_rows_with_a_scalar_mu_or_one_for_each_contact_is_the_same():
     assert lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.0, 0.0, 0.0]).law == "lcp"
-    assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(np.eye(9), np.ones(9), mu=[0.5] * 3)
+    assert lv.Problem.contact(np.eye(9), np.ones(9), mu=0.5) == lv.Problem.contact(
+        np.eye(9), np.ones(9), mu=[0.5] * 3
+    )
     assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2
     assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
 
 
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
 def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
     for problem in (random_lcp(0), random_contact_problem(0), as_matrix(random_contact_problem(0))):
         solution = lv.solve(problem, "pgs", history=True)
@@ -137,7 +144,9 @@ def given_arrays():
         "warm": np.zeros(general.m),
         "key": np.arange(12, dtype=np.uint64),
     }
-    return given | {f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name != "copy"}
+    return given | {
+        f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name != "copy"
+    }
 
 
 def makers(sparse):
@@ -150,12 +159,21 @@ def makers(sparse):
 
     def of_jacobian(g):
         return lv.Problem.from_jacobian(
-            form(g["J"]), form(g["M"]), g["v"], target=g["target"], cones=cones, compliance=g["soft"], guess=g["warm"]
+            form(g["J"]),
+            form(g["M"]),
+            g["v"],
+            target=g["target"],
+            cones=cones,
+            compliance=g["soft"],
+            guess=g["warm"],
         )
 
     def blocks_of_mass(g):
         half = g["M"].shape[0] // 2
-        blocks = [np.ascontiguousarray(g["M"][:half, :half]), np.ascontiguousarray(g["M"][half:, half:])]
+        blocks = [
+            np.ascontiguousarray(g["M"][:half, :half]),
+            np.ascontiguousarray(g["M"][half:, half:]),
+        ]
         made = lv.Problem.from_jacobian(g["J"], blocks, g["v"], target=g["target"], cones=cones)
         assert all(block.flags.writeable for block in blocks)
         return made
@@ -164,18 +182,26 @@ def makers(sparse):
         "linear": lambda g: lv.Problem.linear(form(g["A"]), g["b"], guess=g["guess"]),
         "lcp": lambda g: lv.Problem.lcp(form(g["A"]), g["b"], g["lower"], g["upper"], key=g["key"]),
         "contact": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"]),
-        "spin": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"], patch_radius=g["patch"]),
-        "from_rows": lambda g: lv.Problem.from_rows(of_rows(g), g["target"][: len(g["jac"]) + len(g["normal"])]),
+        "spin": lambda g: lv.Problem.contact(
+            form(g["A"]), g["b"], g["mu"], patch_radius=g["patch"]
+        ),
+        "from_rows": lambda g: lv.Problem.from_rows(
+            of_rows(g), g["target"][: len(g["jac"]) + len(g["normal"])]
+        ),
         "from_jacobian": of_jacobian,
         "blocks of M": blocks_of_mass,
         "updated": lambda g: of_jacobian(given_arrays()).updated(
             J=form(g["J"]), M=form(g["M"]), v_free=g["v"], target=g["target"], guess=g["warm"]
         ),
-        "with a new J": lambda g: of_jacobian(given_arrays()).updated(J=form(g["J"]), b=g["target"]),
-        "of an adopted one": lambda g: lv.Problem.lcp(given_arrays()["A"], given_arrays()["b"], copy=False).updated(
-            b=g["b"], guess=g["guess"]
+        "with a new J": lambda g: of_jacobian(given_arrays()).updated(
+            J=form(g["J"]), b=g["target"]
         ),
-        "of another law": lambda g: random_contact_problem(3).relaxed().updated(b=g["target"], guess=g["warm"]),
+        "of an adopted one": lambda g: lv.Problem.lcp(
+            given_arrays()["A"], given_arrays()["b"], copy=False
+        ).updated(b=g["b"], guess=g["guess"]),
+        "of another law": lambda g: (
+            random_contact_problem(3).relaxed().updated(b=g["target"], guess=g["warm"])
+        ),
         "replaced": lambda g: replace(random_contact_problem(3), b=g["target"], guess=g["warm"]),
     }
 
@@ -200,7 +226,9 @@ def test_problem_with_copy_leaves_arrays_writable_and_unshared(maker, sparse):
 
 def test_problem_without_copy_shares_read_only_arrays():
     given = given_arrays()
-    problem = lv.Problem(given["b"], random_lcp(3).cones, given["A"], guess=given["guess"], copy=False)
+    problem = lv.Problem(
+        given["b"], random_lcp(3).cones, given["A"], guess=given["guess"], copy=False
+    )
     for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
         assert kept is given[name]
         assert not kept.flags.writeable
@@ -223,6 +251,8 @@ def test_from_jacobian_with_mu_has_the_contacts_of_its_rows(rows, bounds, tangen
     mass = np.eye(7)
     v = rng.normal(size=7)
     problem = lv.Problem.from_jacobian(jac, mass, v, **bounds)
-    cones = lv.Cones.contacts(np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0])
+    cones = lv.Cones.contacts(
+        np.broadcast_to(bounds["mu"], (2, *np.shape(bounds["mu"])[1:])), tangents[0]
+    )
     assert problem == lv.Problem.from_jacobian(jac, mass, v, cones=cones)
     assert problem.cones.n_tangents.tolist() == tangents

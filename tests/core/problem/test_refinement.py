@@ -66,7 +66,9 @@ def check_claims(name, law, condition, seed, tol):
     problem = ill_problem(seed, condition, law)
     if registry.get(name).refuses(problem) is not None:
         return
-    solution = lv.solve(problem, name, tol=tol, **({} if registry.get(name).external else {"max_iter": 1000}))
+    solution = lv.solve(
+        problem, name, tol=tol, **({} if registry.get(name).external else {"max_iter": 1000})
+    )
     assert false_claim(problem, solution) is None
     assert not solution.status_conflict or registry.get(name).external
     if condition == 1e2 and law in ("linear", "lcp") and name in ("auto", "newton", "direct"):
@@ -100,7 +102,11 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
                 continue
             accepted += law == "coulomb"
             solution = lv.solve(problem, name, tol=1e-9, max_iter=300_000)
-            if judge_impulse(problem, solution.impulse).relative <= 1e-9 < solution.residual.relative:
+            if (
+                judge_impulse(problem, solution.impulse).relative
+                <= 1e-9
+                < solution.residual.relative
+            ):
                 assert solution.status is lv.Status.ROUNDOFF_LIMIT, (seed, law, str(solution))
                 assert solution.residual.relative <= 2.0 * solution.residual.roundoff_floor <= 1e-4
                 assert solution.iterations < 300_000
@@ -116,7 +122,10 @@ def test_residual_above_the_floor_is_not_converged():
     for seed in range(30):
         problem = ill_problem(seed, 1e13)
         solution = lv.solve(problem, tol=1e-9)
-        assert solution.status in (lv.Status.ROUNDOFF_LIMIT, lv.Status.STALLED) or not solution.impulse.any()
+        assert (
+            solution.status in (lv.Status.ROUNDOFF_LIMIT, lv.Status.STALLED)
+            or not solution.impulse.any()
+        )
         if solution.status is lv.Status.STALLED and solution.residual.relative > 1e-5:
             assert not solution.residual.at_floor
             seen += "ill-conditioned" in solution.message
@@ -150,19 +159,27 @@ def test_refinement_floor_bounds_the_loss_of_the_first_pass(seed, condition):
 
 @settings(max_examples=20)
 @given(seed=seeds, condition=st.sampled_from([1e8, 1e10, 1e11]))
-def test_residual_loose_tolerance_and_ill_conditioned_m_reports_the_error_in_long_double(seed, condition):
+def test_residual_loose_tolerance_and_ill_conditioned_m_reports_the_error_in_long_double(
+    seed, condition
+):
     """The first pass alone has a residual of 1e-14 and a floor of 1e-16, but loses up to a tenth of the tolerance."""
     problem = ill_problem(seed, condition, "linear")
     lam = lv.solve(problem, tol=1e-3).impulse
     truth = judge_twin.Problem(spec_of(problem)).judge(lam)
     many = lv.residual_many([problem], [lam])
     for relative, floor in (
-        (lv.residual(problem, lam, tol=1e-2).relative, lv.residual(problem, lam, tol=1e-2).roundoff_floor),
+        (
+            lv.residual(problem, lam, tol=1e-2).relative,
+            lv.residual(problem, lam, tol=1e-2).roundoff_floor,
+        ),
         (lv.solve(problem, impulse=lam, tol=1e-2).residual.relative, 0.0),
         (many.relative[0], many.roundoff_floor[0]),
     ):
         assert abs(relative - truth.relative) <= 1e-8 + truth.allowed + 1e-2 * truth.relative
-        assert floor == 0.0 or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
+        assert (
+            floor == 0.0
+            or floor >= 0.1 * abs(judge_impulse(problem, lam).relative - truth.relative) - 1e-8
+        )
 
 
 def test_residual_of_a_well_conditioned_m_is_not_refined():

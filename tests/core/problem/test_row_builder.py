@@ -34,14 +34,24 @@ def solved(builder, solver="auto", tol=TOL, **more):
     return solution, builder.velocity_after(problem, solution.impulse)
 
 
-PENDULUM = -G * DT * 1.2 / (1 / 6.0 + 1.2**2)  # rad/s after a step of 2 kg with 1/3 kg m^2 at 1.2 m from the anchor
+PENDULUM = (
+    -G * DT * 1.2 / (1 / 6.0 + 1.2**2)
+)  # rad/s after a step of 2 kg with 1/3 kg m^2 at 1.2 m from the anchor
 ERROR = np.array([0.01, -0.02])  # m, of a joint's anchors
 TURNED = -0.5 * 0.1 / DT  # rad/s that remove half of 0.1 rad
 #: Of one planar body: blocks with the world by method, the velocity before the step, and that after it.
 CLOSED_FORMS = [
     ({"motor": {"speed": 2.0, "max_torque": 1000.0}}, (0, 0, 0), (0, 0, 2.0)),
-    ({"motor": {"speed": 2.0, "max_torque": 1.0}}, (0, 0, 0), (0, 0, 1.0 * DT * 3.0)),  # its torque is too small
-    ({"motor": {"axis": (2.0, 0.0), "speed": 1.0, "max_force": 10.0, "anchor": BODY}}, (0, 0, 0), (5.0 * DT, 0, 0)),
+    (
+        {"motor": {"speed": 2.0, "max_torque": 1.0}},
+        (0, 0, 0),
+        (0, 0, 1.0 * DT * 3.0),
+    ),  # its torque is too small
+    (
+        {"motor": {"axis": (2.0, 0.0), "speed": 1.0, "max_force": 10.0, "anchor": BODY}},
+        (0, 0, 0),
+        (5.0 * DT, 0, 0),
+    ),
     (
         {
             "slider": {"anchor": BODY, "axis": (1.0, 0.0)},
@@ -61,7 +71,11 @@ CLOSED_FORMS = [
         )
     ),  # beyond the upper limit
     *(
-        ({"contact": {"point": BODY, "normal": (0.0, 1.0), "gap": gap, "restitution": e}}, (0, speed, 0), (0, after, 0))
+        (
+            {"contact": {"point": BODY, "normal": (0.0, 1.0), "gap": gap, "restitution": e}},
+            (0, speed, 0),
+            (0, after, 0),
+        )
         for gap, speed, e, after in (
             (0.0, -2.0, 0.5, 1.0),
             (0.0, -0.9, 0.5, 0.0),  # below the threshold of 1 m/s
@@ -103,14 +117,19 @@ CLOSED_FORMS_OF_OTHERS = [
     (
         {"weld": {"anchor": BODY, "anchor_b": BODY + ERROR, "angle_error": 0.1}},
         (0, 0, 0),
-        (-0.5 * ERROR[0] / DT + TURNED * ERROR[1], -0.5 * ERROR[1] / DT - TURNED * ERROR[0], TURNED),
+        (
+            -0.5 * ERROR[0] / DT + TURNED * ERROR[1],
+            -0.5 * ERROR[1] / DT - TURNED * ERROR[0],
+            TURNED,
+        ),
         {"baumgarte": 0.5},
     ),
 ]
 
 
 @pytest.mark.parametrize(
-    ("blocks", "before", "after", "more"), [*((*form, {}) for form in CLOSED_FORMS), *CLOSED_FORMS_OF_OTHERS]
+    ("blocks", "before", "after", "more"),
+    [*((*form, {}) for form in CLOSED_FORMS), *CLOSED_FORMS_OF_OTHERS],
 )
 def test_blocks_of_one_planar_body_give_the_velocity_in_closed_form(blocks, before, after, more):
     builder = planar(before, slop=0.01, **more)
@@ -123,7 +142,9 @@ def test_blocks_of_one_planar_body_give_the_velocity_in_closed_form(blocks, befo
 def test_gear_turns_in_its_ratio_and_conserves_exchanged_impulses():
     ratio = 3.0
     inertia = np.array([2.0, 5.0])
-    builder = lv.RowBuilder([1.0, 1.0], 1 / inertia, [(0, 0, 4.0), (0, 0, 0)], DT, np.array([(0, 0), (4, 0)]))
+    builder = lv.RowBuilder(
+        [1.0, 1.0], 1 / inertia, [(0, 0, 4.0), (0, 0, 0)], DT, np.array([(0, 0), (4, 0)])
+    )
     builder.hinge(-1, 0, (0.0, 0.0))
     builder.hinge(-1, 1, (4.0, 0.0))
     gear = builder.gear(0, 1, ratio=ratio)
@@ -131,7 +152,9 @@ def test_gear_turns_in_its_ratio_and_conserves_exchanged_impulses():
     omega = after[:, 2]
     assert omega[0] + ratio * omega[1] == pytest.approx(0.0, abs=1e-10)
     impulse = solution.impulse[builder.rows_of(gear)][0]
-    np.testing.assert_allclose(inertia * (omega - [4.0, 0.0]), impulse * np.array([1.0, ratio]), **EXACT)
+    np.testing.assert_allclose(
+        inertia * (omega - [4.0, 0.0]), impulse * np.array([1.0, ratio]), **EXACT
+    )
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
@@ -172,7 +195,9 @@ def test_a_weld_leaves_no_relative_velocity():
 
 def test_a_hinge_in_space_rotates_about_its_axis_alone():
     axis = np.array([1.0, 2.0, -0.5])
-    builder = spatial(np.random.default_rng(5).normal(size=(2, 6)), np.array([(0.0, 0, 0), (1.0, 0.2, 0)]))
+    builder = spatial(
+        np.random.default_rng(5).normal(size=(2, 6)), np.array([(0.0, 0, 0), (1.0, 0.2, 0)])
+    )
     builder.hinge(0, 1, (0.5, 0.1, 0.0), axis)
     builder.motor(0, 1, axis, speed=2.0, max_torque=1e6)
     _, after = solved(builder)
@@ -234,7 +259,9 @@ def test_row_builder_in_two_dimensions_equals_a_plane_in_three():
 def test_row_builder_keys_carry_impulses_to_another_order():
     def build(order):
         builder = planar((0.3, -1.0, 0.0))
-        keys = {i: builder.contact(-1, 0, (1.0 + i, -1.2), (0.0, 1.0), mu=0.5, feature=i) for i in order}
+        keys = {
+            i: builder.contact(-1, 0, (1.0 + i, -1.2), (0.0, 1.0), mu=0.5, feature=i) for i in order
+        }
         return builder, keys
 
     first, keys = build([0, 1, 2])
@@ -269,15 +296,21 @@ def largest_velocity_of_a_stack(slop, n=4, dt=1 / 120, steps=360, **options):
     solution = None
     largest = []
     for _ in range(steps):
-        builder = lv.RowBuilder(np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop)
+        builder = lv.RowBuilder(
+            np.ones(n), np.full(n, 6.0), velocity - (0.0, G * dt, 0.0), dt, position, slop=slop
+        )
         turn = [np.array([(np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a))]) for a in angle]
         for k in range(n):
-            below, frame = (position[k - 1], turn[k - 1]) if k else (np.array((0.0, -0.5)), np.eye(2))
+            below, frame = (
+                (position[k - 1], turn[k - 1]) if k else (np.array((0.0, -0.5)), np.eye(2))
+            )
             for i, x in enumerate((-0.5, 0.5)):
                 along, height = (position[k] + turn[k] @ (x, -0.5) - below) @ frame
                 point = below + frame @ (np.clip(along, -0.5, 0.5) if k else along, height)
                 if height - 0.5 < 0.02:
-                    builder.contact(k - 1, k, point, frame @ (0.0, 1.0), gap=height - 0.5, mu=0.6, feature=i)
+                    builder.contact(
+                        k - 1, k, point, frame @ (0.0, 1.0), gap=height - 0.5, mu=0.6, feature=i
+                    )
         problem = builder.problem()
         start = None if solution is None else problem.carry(solution)
         solution = lv.solve(problem, "pgs", impulse=start, **options)
@@ -322,7 +355,13 @@ ARRAYS = {
     "motor": {"axis": "axis", "speed": "number", "max_torque": "number"},
     "limit": {"axis": "axis", "value": "number", "upper": "number", "anchor": "point"},
     "gear": {"axis_a": "axis", "axis_b": "axis", "ratio": "number", "angle_error": "number"},
-    "contact": {"point": "point", "normal": "unit", "gap": "number", "mu": "number", "restitution": "number"},
+    "contact": {
+        "point": "point",
+        "normal": "unit",
+        "gap": "number",
+        "mu": "number",
+        "restitution": "number",
+    },
 }
 
 
@@ -336,7 +375,9 @@ def draw_arguments(rng, block_type, n, dimensions):
             elif block_type == "limit":
                 values[name] = rng.normal(size=(n, 2))
             continue  # In two dimensions, axes of rotation are not given.
-        values[name] = rng.uniform(0.1, 0.9, size=n) if kind == "number" else rng.normal(size=(n, dimensions))
+        values[name] = (
+            rng.uniform(0.1, 0.9, size=n) if kind == "number" else rng.normal(size=(n, dimensions))
+        )
         if kind == "unit":
             values[name] /= np.linalg.norm(values[name], axis=1)[:, None]
     return values
@@ -348,7 +389,13 @@ def test_row_builder_with_arrays_of_blocks_has_the_bits_of_single_calls(dimensio
     rng = np.random.default_rng(seed)
     n = 4
     inertia = np.full(3, 2.0) if dimensions == 2 else np.tile(2.0 * np.eye(3), (3, 1, 1))
-    bodies = (np.ones(3), inertia, rng.normal(size=(3, 3 * dimensions - 3)), DT, rng.normal(size=(3, dimensions)))
+    bodies = (
+        np.ones(3),
+        inertia,
+        rng.normal(size=(3, 3 * dimensions - 3)),
+        DT,
+        rng.normal(size=(3, dimensions)),
+    )
     single, arrays = lv.RowBuilder(*bodies), lv.RowBuilder(*bodies)
     single_keys, array_keys = [], []
     for block_type in rng.permutation(list(ARRAYS)):
@@ -386,7 +433,12 @@ def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_clos
         free[0, up] -= 9.81 * h
         normal = np.eye(n)[up]
         builder = lv.RowBuilder(
-            [1.0], [6.0] if planar else [6.0 * np.eye(3)], free, h, position=[0.5 * normal], velocity_before=before
+            [1.0],
+            [6.0] if planar else [6.0 * np.eye(3)],
+            free,
+            h,
+            position=[0.5 * normal],
+            velocity_before=before,
         )
         builder.contact(-1, 0, np.zeros(n), normal, restitution=e, restitution_threshold=0.0)
         problem = builder.problem()
@@ -400,10 +452,14 @@ def test_contact_restitution_on_the_velocity_before_the_step_bounces_as_the_clos
 def test_rows_in_two_dimensions_move_bodies_in_their_plane_alone(block_type, coincide, seed):
     """Of points that coincide too, whose direction is chosen."""
     rng = np.random.default_rng(seed)
-    builder = lv.RowBuilder(np.ones(2), np.full(2, 2.0), rng.normal(size=(2, 3)), DT, np.zeros((2, 2)))
+    builder = lv.RowBuilder(
+        np.ones(2), np.full(2, 2.0), rng.normal(size=(2, 3)), DT, np.zeros((2, 2))
+    )
     values = draw_arguments(rng, block_type, 1, 2)
     if coincide:
-        values |= {name: np.zeros((1, 2)) for name, kind in ARRAYS[block_type].items() if kind == "point"}
+        values |= {
+            name: np.zeros((1, 2)) for name, kind in ARRAYS[block_type].items() if kind == "point"
+        }
     getattr(builder, block_type)(0, 1, **{name: x[0].tolist() for name, x in values.items()})
     problem = builder.problem()
     jac = problem.rows.jacobian(problem.cones).toarray().reshape(-1, 2, 6)

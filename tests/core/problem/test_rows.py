@@ -15,7 +15,11 @@ from lavender_ext.core import checks
 def fields(seed):
     """Arrays of legal rows: joints of 1 to 3 rows, contacts between random bodies or a body and the ground."""
     rows = random_bodies_and_contacts(np.random.default_rng(seed), bodies=3, joints=2, contacts=4)
-    return {f.name: np.array(getattr(rows, f.name)) for f in dataclasses.fields(rows) if f.name != "copy"}
+    return {
+        f.name: np.array(getattr(rows, f.name))
+        for f in dataclasses.fields(rows)
+        if f.name != "copy"
+    }
 
 
 SPOILT = {
@@ -71,7 +75,12 @@ def test_sweeps_quick_check_equals_the_full_residual(what, seed):
         patch.setattr(checks, "find_body_fault", _fault_or_frame)
         slow = outcome(given)
     assert quick == slow
-    legal = ("nothing", "a joint of nobody", "a normal too long by 1e-11", "a normal too long by 1e-7")
+    legal = (
+        "nothing",
+        "a joint of nobody",
+        "a normal too long by 1e-11",
+        "a normal too long by 1e-7",
+    )
     also = (
         "an inertia about one axis",
         "an inertia of a point",
@@ -93,7 +102,11 @@ def test_rows_in_float32_are_widened_exactly():
     n /= np.linalg.norm(n, axis=1)[:, None]
     t = np.cross(n, turn)
     t /= np.linalg.norm(t, axis=1)[:, None]
-    flat = np.linalg.qr(rng.normal(size=(10, 3, 3)))[0] * [1.0, 2.0, 0.0]  # a plane body: one direction does not turn
+    flat = np.linalg.qr(rng.normal(size=(10, 3, 3)))[0] * [
+        1.0,
+        2.0,
+        0.0,
+    ]  # a plane body: one direction does not turn
     tensor = flat @ flat.transpose(0, 2, 1)
     single = {"normal": n, "tangent": t, "inv_inertia": tensor, "inv_mass": np.ones(10)}
     more = {
@@ -110,12 +123,16 @@ def test_rows_in_float32_are_widened_exactly():
     np.testing.assert_allclose(rows.normal, n, atol=1e-6)
     np.testing.assert_allclose(rows.inv_inertia, tensor, atol=1e-5)
     assert np.array_equal(rows.inv_inertia, rows.inv_inertia.transpose(0, 2, 1))
-    assert np.linalg.eigvalsh(rows.inv_inertia).min() > -1e-9 * 4.0  # which is allowed of the largest entry
+    assert (
+        np.linalg.eigvalsh(rows.inv_inertia).min() > -1e-9 * 4.0
+    )  # which is allowed of the largest entry
     assert lv.solve(lv.Problem.from_rows(rows, mu=0.5), tol=1e-6).success
     whole = lv.Rows(**single, **more)  # what float64 normalised keeps its bits
     assert np.array_equal(whole.normal, n)
     with pytest.raises(lv.InputError, match=r"contact 4: .*off by 0\.0001.*float32"):
-        lv.Rows(**single | {"normal": n * np.where(np.arange(20) == 4, 1.0001, 1.0)[:, None]}, **more)
+        lv.Rows(
+            **single | {"normal": n * np.where(np.arange(20) == 4, 1.0001, 1.0)[:, None]}, **more
+        )
 
 
 def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
@@ -133,10 +150,15 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
     impulse = np.arange(1.0, 8.0)
     wanted = [7.0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]  # 2 has lost its tangents: it starts anew
     assert now.carry((before, impulse)).tolist() == wanted
-    assert dataclasses.replace(now, key=None).carry((before, impulse), keys=[9, 5, 7, 2]).tolist() == wanted
+    assert (
+        dataclasses.replace(now, key=None).carry((before, impulse), keys=[9, 5, 7, 2]).tolist()
+        == wanted
+    )
     solution = lv.solve(before, tol=1e-9)
     assert np.array_equal(before.carry(solution), solution.impulse)
-    three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
+    three, four = (
+        lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4)
+    )  # without keys, by the same blocks
     assert three.carry((three, np.ones(3))).all()
     keyed = dataclasses.replace(four, key=np.arange(4))
     twice = dataclasses.replace(three, key=[7, 8, 7])
@@ -148,7 +170,9 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
     ):
         with pytest.raises(lv.InputError, match=words):
             problem.carry((previous, np.ones(3)))
-    assert not lv.report.carry_impulses(three, np.ones(3), four).any()  # a report starts such a step from zero
+    assert not lv.report.carry_impulses(
+        three, np.ones(3), four
+    ).any()  # a report starts such a step from zero
     assert np.array_equal(dataclasses.replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (
         (np.zeros(7), None, "a Solution"),
@@ -163,10 +187,15 @@ def test_problem_carry_keeps_impulses_by_key_and_starts_new_blocks_at_zero():
 def test_problem_carry_of_random_keys_equals_a_dict(seed):
     rng = np.random.default_rng(seed)
     # The highest bits of a key are the type of a block, so that many keys differ in a few high bits only.
-    pool = rng.permutation(np.uint64(2) ** rng.integers(0, 64, 60, dtype=np.uint64) + np.arange(60, dtype=np.uint64))
+    pool = rng.permutation(
+        np.uint64(2) ** rng.integers(0, 64, 60, dtype=np.uint64) + np.arange(60, dtype=np.uint64)
+    )
 
     def step():
-        cones = [(lv.Cones.free(1), lv.Cones.contacts(0.5))[i] for i in rng.integers(0, 2, rng.integers(1, 30))]
+        cones = [
+            (lv.Cones.free(1), lv.Cones.contacts(0.5))[i]
+            for i in rng.integers(0, 2, rng.integers(1, 30))
+        ]
         blocks = sum(cones[1:], cones[0])
         key = rng.choice(np.unique(pool), blocks.n_blocks, replace=False)
         return lv.Problem(np.ones(blocks.n_rows), blocks, np.eye(blocks.n_rows), key=key)

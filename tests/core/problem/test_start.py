@@ -12,17 +12,23 @@ def make_steps():
     first = random_contact_problem(3)
     first = lv.Problem(first.b, first.cones, first.csr, key=np.arange(first.n_blocks))
     joints, contacts = (np.flatnonzero(first.cones.is_contact == x) for x in (False, True))
-    blocks = np.concatenate([joints, contacts[::-1][1:]])  # One contact has ended, the others are in another order.
+    blocks = np.concatenate(
+        [joints, contacts[::-1][1:]]
+    )  # One contact has ended, the others are in another order.
     rows = np.concatenate([np.arange(*first.cones.ptr[i : i + 2]) for i in blocks])
     matrix = first.csr[rows][:, rows]
-    second = lv.Problem(1.1 * first.b[rows], first.cones.select(blocks), matrix, key=first.key[blocks])
+    second = lv.Problem(
+        1.1 * first.b[rows], first.cones.select(blocks), matrix, key=first.key[blocks]
+    )
     return first, second, lv.solve(first, "pgs", max_iter=30), rows
 
 
 CALLS = {
     "solve": lambda problem, impulse: lv.solve(problem, "pgs", impulse=impulse, max_iter=3).impulse,
     "compiled call": lambda problem, impulse: lv.solve(problem, impulse=impulse).impulse,
-    "prepare": lambda problem, impulse: lv.prepare(problem, "pgs").solve(impulse=impulse, max_iter=3).impulse,
+    "prepare": lambda problem, impulse: (
+        lv.prepare(problem, "pgs").solve(impulse=impulse, max_iter=3).impulse
+    ),
     "list": lambda problem, impulse: lv.solve_many([problem], impulses=[impulse])[0].impulse,
     "residual": lambda problem, impulse: lv.residual(problem, impulse).error,
     "residuals": lambda problem, impulse: lv.residual_many([problem], [impulse])[0].error,
@@ -35,7 +41,12 @@ CALLS = {
 def test_solution_and_pair_as_impulse_are_carried_by_their_keys(name):
     first, second, solution, rows = make_steps()
     expected = CALLS[name](second, solution.impulse[rows])
-    for given in (solution, (first, solution.impulse), second.carry(solution), solution.impulse[rows].tolist()):
+    for given in (
+        solution,
+        (first, solution.impulse),
+        second.carry(solution),
+        solution.impulse[rows].tolist(),
+    ):
         np.testing.assert_array_equal(CALLS[name](second, given), expected)
     assert not np.array_equal(CALLS[name](second, np.zeros(second.m)), expected)
 
@@ -54,8 +65,15 @@ def test_solve_qp_and_batches_start_from_a_result():
     h = np.array([0.5])
     problem = lv.Problem.from_qp(P, q, G, h)
     solution = lv.solve(problem, tol=1e-9)
-    np.testing.assert_array_equal(lv.solve(problem, "pgs", impulse=solution).impulse, solution.impulse)
-    batch = lv.Batch(np.ones((2, 1, 1)), np.ones((2, 1, 1)), -np.ones((2, 1)), cones=lv.Cones.bounded([0.0], [9.0]))
+    np.testing.assert_array_equal(
+        lv.solve(problem, "pgs", impulse=solution).impulse, solution.impulse
+    )
+    batch = lv.Batch(
+        np.ones((2, 1, 1)),
+        np.ones((2, 1, 1)),
+        -np.ones((2, 1)),
+        cones=lv.Cones.bounded([0.0], [9.0]),
+    )
     result = lv.solve_many(batch, "pgs", tol=1e-9)
     again = lv.solve_many(batch, "pgs", tol=1e-6, impulse=result)
     assert not np.any(again.iterations)

@@ -17,7 +17,9 @@ def test_states_of_an_accurate_answer_are_those_of_a_more_accurate_one(kind):
             scale = np.abs(exact.impulse).max(initial=1.0)
             rng = np.random.default_rng(seed)
             for size in (1e-4, 1e-8):
-                states = compute_states(problem, exact.impulse + size * scale * rng.standard_normal(problem.m))
+                states = compute_states(
+                    problem, exact.impulse + size * scale * rng.standard_normal(problem.m)
+                )
                 # A perturbation of y = l - w/d is at most 1 + |A|/d times that of l, 1e3 covers these problems.
                 for i in np.flatnonzero(exact.states.margin > 1e3 * size * scale):
                     assert states.names[i] == exact.states.names[i]

@@ -41,7 +41,10 @@ def test_prepared_solver_in_a_second_thread_raises():
 
 @pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="this Python has a GIL")
 def test_kernels_do_not_enable_the_gil():
-    modules = [".".join(p.relative_to(KERNELS.parent).with_suffix("").parts) for p in KERNELS.rglob("*.pyx")]
+    modules = [
+        ".".join(p.relative_to(KERNELS.parent).with_suffix("").parts)
+        for p in KERNELS.rglob("*.pyx")
+    ]
     code = f"""
 import importlib, sys
 import lavender

@@ -57,7 +57,9 @@ def test_velocity_errors_change_with_the_unit_of_length_as_their_units_say(kind,
     scaled, factor = scale_lengths(problem)
     relative = lv.residual(scaled, factor * impulse).relative
     assert relative == pytest.approx(lv.residual(problem, impulse).relative, rel=1e-9)
-    if kind != "ellipses":  # One body that only turns: the error of its angular rows is not converted.
+    if (
+        kind != "ellipses"
+    ):  # One body that only turns: the error of its angular rows is not converted.
         inv_mass = problem.rows.inv_mass.copy()
         inv_mass[problem.rows.joint_body[0]] = 0.0
         problem = replace(problem, rows=replace(problem.rows, inv_mass=inv_mass))
@@ -67,7 +69,9 @@ def test_velocity_errors_change_with_the_unit_of_length_as_their_units_say(kind,
     units = np.array([problem.row_unit(i) for i in range(problem.m)])
     expected = np.where(units == "m/s", LENGTH, 1.0) * before.velocity_by_row
     # Rounding of a row's own terms: sums with mixed units round differently.
-    np.testing.assert_allclose(after.velocity_by_row, expected, rtol=1e-9, atol=1e-12 * expected.max())
+    np.testing.assert_allclose(
+        after.velocity_by_row, expected, rtol=1e-9, atol=1e-12 * expected.max()
+    )
 
 
 @given(seed=seeds)
@@ -75,7 +79,11 @@ def test_rows_of_j_and_m_declare_which_are_angular(seed):
     bodies = random_contact_problem(seed)
     mass = np.linalg.inv(bodies.rows.inverse_mass_matrix().toarray())
     problem = lv.Problem.from_jacobian(
-        bodies.jacobian, mass, bodies.rows.v_free.ravel(), cones=bodies.cones, angular=bodies.angular_rows
+        bodies.jacobian,
+        mass,
+        bodies.rows.v_free.ravel(),
+        cones=bodies.cones,
+        angular=bodies.angular_rows,
     )
     joints = np.flatnonzero(bodies.angular_rows & ~bodies.cones.contact_rows)
     assert len(joints) and {problem.row_unit(i) for i in joints} == {"rad/s"}
@@ -86,9 +94,15 @@ def test_rows_of_j_and_m_declare_which_are_angular(seed):
 
 def test_texts_of_an_angular_row_have_its_unit(tmp_path):
     cones = lv.Cones.bounded([0.0, 0.0], [9.0, 9.0])
-    problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), [-1.0, -2.0], cones=cones, angular=[False, True])
+    problem = lv.Problem.from_jacobian(
+        np.eye(2), np.eye(2), [-1.0, -2.0], cones=cones, angular=[False, True]
+    )
     judged = lv.residual(problem, np.zeros(2))
-    assert (judged.worst_row, judged.velocity_unit, judged.worst_label) == (1, "rad/s", "row 1 [rad/s]")
+    assert (judged.worst_row, judged.velocity_unit, judged.worst_label) == (
+        1,
+        "rad/s",
+        "row 1 [rad/s]",
+    )
     assert "worst row 1 (2 rad/s)" in str(judged)
     assert "worst row 0 (1 m/s)" in str(lv.residual(problem, [0.0, 2.0]))
     assert "rows 2 rad/s (row 1)" in str(lv.motion_error(problem, np.zeros(2)))
@@ -108,7 +122,9 @@ MODEL = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="
 
 
 def test_from_mujoco_rows_of_every_kind_have_the_unit_of_their_velocity():
-    mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
+    mujoco = pytest.importorskip(
+        "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+    )
     model = mujoco.MjModel.from_xml_string(MODEL)
     data = mujoco.MjData(model)
     data.qpos[:2] = 1.5, 1.5
@@ -130,5 +146,9 @@ def test_from_mujoco_rows_of_every_kind_have_the_unit_of_their_velocity():
         "limit of joint slide": "m",
         "limit of joint ball": "r",
     }
-    spin = [i for i in range(problem.m) if "spin" in problem.row_name(i) or "roll" in problem.row_name(i)]
+    spin = [
+        i
+        for i in range(problem.m)
+        if "spin" in problem.row_name(i) or "roll" in problem.row_name(i)
+    ]
     assert len(spin) == 3 and {problem.row_unit(i) for i in spin} == {"m/s"}  # nu of the normal.

@@ -11,7 +11,12 @@ import lavender as lv
 
 P = np.array([[4.0, 1.0], [1.0, 2.0]])
 q = np.array([1.0, 1.0])
-ROWS = {"G": np.array([[-1.0, 1.0]]), "h": np.array([0.0]), "A": np.array([[1.0, 1.0]]), "b": np.array([1.0])}
+ROWS = {
+    "G": np.array([[-1.0, 1.0]]),
+    "h": np.array([0.0]),
+    "A": np.array([[1.0, 1.0]]),
+    "b": np.array([1.0]),
+}
 X = np.array([0.5, 0.5])
 
 
@@ -23,7 +28,9 @@ def test_qp_solve_qp_has_the_signature_and_the_result_of_qpsolvers():
     assert [own[name].default for name in own] == [other[name].default for name in other]
     box = {"lb": np.zeros(2), "ub": np.full(2, 0.7)}
     for name in installed("osqp", "clarabel", "piqp", "daqp"):
-        here, there = (m.solve_qp(P, q, **ROWS, **box, solver=name, verbose=False) for m in (lv.qp, qpsolvers))
+        here, there = (
+            m.solve_qp(P, q, **ROWS, **box, solver=name, verbose=False) for m in (lv.qp, qpsolvers)
+        )
         np.testing.assert_allclose(here, there, atol=2e-3)  # OSQP stops at 1e-3
         np.testing.assert_allclose(here, X, atol=1e-6)
         here[0] = 1.0  # x is the caller's own array
@@ -32,7 +39,9 @@ def test_qp_solve_qp_has_the_signature_and_the_result_of_qpsolvers():
 
 
 def test_available_solvers_solve_a_program():
-    assert {"auto", "newton", "osqp"} <= set(lv.available_solvers) and lv.available_solvers is lv.qp.available_solvers
+    assert {"auto", "newton", "osqp"} <= set(
+        lv.available_solvers
+    ) and lv.available_solvers is lv.qp.available_solvers
     for name in lv.available_solvers:
         assert lv.solve_qp(P, q, lb=[0.0, 0.0], solver=name, tol=1e-6).found, name
 
@@ -56,7 +65,10 @@ def test_solve_qp_accepts_the_arguments_of_qpsolvers(changes):
 
 def test_solve_qp_passes_settings_by_name_to_the_backend():
     problem = lv.Problem.from_qp(P, q, **ROWS)
-    work = [lv.solve_qp(problem, "osqp", max_iter=100, check_termination=n).solution.work for n in (1, 25)]
+    work = [
+        lv.solve_qp(problem, "osqp", max_iter=100, check_termination=n).solution.work
+        for n in (1, 25)
+    ]
     assert work[0]["iterations"] < work[1]["iterations"]
     with pytest.raises(lv.LavenderError, match="eps_abz"):
         lv.solve_qp(problem, "osqp", eps_abz=1e-3)

@@ -36,7 +36,9 @@ def drawn(seed, singular=False):
         qp["G"] = rng.normal(size=(mi, n)) * (rng.random((mi, 1)) < 0.8)
         qp["h"] = qp["G"] @ x + rng.random(mi) * rng.integers(0, 2, mi)
         qp["h"][rng.random(mi) < 0.1] = np.inf
-    if singular or rng.random() < 0.6:  # a box around all variables, so that no objective falls for ever
+    if (
+        singular or rng.random() < 0.6
+    ):  # a box around all variables, so that no objective falls for ever
         share = 1.0 if singular else 0.7
         fixed = rng.random(n) < 0.15
         for bound, sign in (("lb", -1.0), ("ub", 1.0)):
@@ -63,7 +65,9 @@ def test_solve_qp_found_holds_by_the_errors_of_osqp(seed, tol, off):
         assert answer.found, (answer.error, primal, dual, gap)
     if answer.found and best.found and cancelled > 1e-2:
         size = np.abs(best.impulse).sum() + np.abs(best.x).sum() + 1.0
-        assert abs(answer.objective - best.objective) <= 10.0 * tol * size * (1.0 + abs(best.objective))
+        assert abs(answer.objective - best.objective) <= 10.0 * tol * size * (
+            1.0 + abs(best.objective)
+        )
 
 
 def sparse(qp, make=sp.csc_matrix):
@@ -82,7 +86,9 @@ def test_solve_qp_answer_has_no_residual_and_no_gap(seed):
     np.testing.assert_allclose(own, found, atol=1e-11 * size**2)  # rounding alone
     assert answer.found
     x = answer.x
-    np.testing.assert_allclose(answer.objective, 0.5 * x @ qp["P"] @ x + qp["q"] @ x, atol=1e-11 * size**2)
+    np.testing.assert_allclose(
+        answer.objective, 0.5 * x @ qp["P"] @ x + qp["q"] @ x, atol=1e-11 * size**2
+    )
 
 
 def nearly_singular(seed):
@@ -122,7 +128,9 @@ def test_solve_qp_with_a_nearly_singular_p_is_solved(seed):
     assert dual <= 1e-7 * max(np.abs(qp["q"]).max(), np.abs(qp["G"].T @ answer.z).max())
 
 
-@pytest.mark.filterwarnings("ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access")
+@pytest.mark.filterwarnings(
+    "ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access"
+)
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @given(seed=seeds)
 def test_x_and_multipliers_equal_qpsolvers(backend, seed):
@@ -143,8 +151,15 @@ def test_x_and_multipliers_equal_qpsolvers(backend, seed):
     answer = lv.solve_qp(lv.Problem.from_qp(qp))
     assert other.is_optimal(1e-5)
     size = 1.0 + max(np.abs(part).max() for part in (answer.x, answer.y, answer.z, answer.z_box))
-    for name in ("x", "y", "z", "z_box"):  # wrong by the backend's tolerance over curvatures and angles of rows
-        np.testing.assert_allclose(getattr(answer, name), getattr(other, name), atol=1e-3 * size, err_msg=name)
+    for name in (
+        "x",
+        "y",
+        "z",
+        "z_box",
+    ):  # wrong by the backend's tolerance over curvatures and angles of rows
+        np.testing.assert_allclose(
+            getattr(answer, name), getattr(other, name), atol=1e-3 * size, err_msg=name
+        )
 
 
 @given(seed=seeds)
@@ -168,7 +183,10 @@ def with_far_rows(qp, seed, far):
     n = len(qp["q"])
     more = rng.normal(size=(3, n)) * 10.0 ** rng.uniform(-3.0, 3.0, (3, 1))
     G, h = (np.zeros((0, n)), []) if qp["G"] is None else (qp["G"], qp["h"])
-    return qp | {"G": np.vstack([G, more]), "h": np.concatenate([h, far * rng.uniform(1.0, 2.0, 3)])}
+    return qp | {
+        "G": np.vstack([G, more]),
+        "h": np.concatenate([h, far * rng.uniform(1.0, 2.0, 3)]),
+    }
 
 
 @given(seed=seeds, far=st.integers(4, 19), off=st.sampled_from([0.0, 1e-6, 1e-2]))
@@ -195,9 +213,13 @@ def test_solve_qp_within_the_tolerance_of_the_program_has_converged(plug_in):
         return lv.Claim(lv.Status.STALLED, 1, message="its last digits")
 
     # v* is far from x, so that the program's error is larger than the residual.
-    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[5.0, 5.0])
+    problem = lv.Problem.from_qp(
+        2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[5.0, 5.0]
+    )
     answer = lv.solve_qp(problem, plug_in(run), tol=1e-6)
-    assert answer.found and answer.solution.status is lv.Status.CONVERGED and answer.solution.success
+    assert (
+        answer.found and answer.solution.status is lv.Status.CONVERGED and answer.solution.success
+    )
 
 
 # -- what has no solution --------------------------------------------------------------------------
@@ -210,7 +232,9 @@ def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
     root = rng.normal(size=(n, n))
     G = rng.normal(size=(120, n))
     h = G @ rng.normal(size=n)
-    problem = lv.Problem.from_qp(root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0])
+    problem = lv.Problem.from_qp(
+        root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0]
+    )
     solution = lv.solve_qp(problem).solution
     assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
     assert (solution.impulse >= 0.0).all()
@@ -224,7 +248,10 @@ def test_solve_qp_of_an_infeasible_program_has_the_residual_of_its_impulse():
         (np.diag([1.0, 0.0]), [1.0, -1.0], {"G": [[1.0, 0.0]], "h": [1.0]}),
         (np.ones((2, 2)), [1.0, -1.0], {"A": [[0.0, 0.0]], "b": [0.0]}),
         (np.zeros((2, 2)), [8.0, -28.0], {"lb": [-0.5, 0.5], "ub": [0.25, np.inf]}),
-        *((np.zeros((2, 2)), [-1.0, 0.0], {"G": -np.eye(2), "h": h}) for h in ([-2.0, -1.0], [-0.5, 3.0])),
+        *(
+            (np.zeros((2, 2)), [-1.0, 0.0], {"G": -np.eye(2), "h": h})
+            for h in ([-2.0, -1.0], [-0.5, 3.0])
+        ),
     ],
 )
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
@@ -237,7 +264,10 @@ def test_solve_qp_of_an_unbounded_program_returns_a_ray(hessian, q, rows, tol):
     np.testing.assert_allclose(hessian @ d, 0.0, atol=1e-6)
     assert np.dot(q, d) < -0.5
     assert rows.get("lb") is None or d.min() >= -1e-6
-    assert "G" not in rows or ((rows["G"] @ answer.x <= np.array(rows["h"]) + 1e-9) & (rows["G"] @ d <= 1e-12)).all()
+    assert (
+        "G" not in rows
+        or ((rows["G"] @ answer.x <= np.array(rows["h"]) + 1e-9) & (rows["G"] @ d <= 1e-12)).all()
+    )
 
 
 @pytest.mark.parametrize("solver", ["auto", "osqp"])
@@ -247,7 +277,8 @@ def test_infeasible_program_is_never_called_unbounded(solver, tol):
     rows = np.array([[0.0, 1.0, 1.0], [0.0, -1.0, -1.0], [-1.0, 0.0, 1.0]])
     program = {"P": np.diag([0.0, 1.0, 0.0]), "q": [-1.0, 0.5, 0.0], "G": rows}
     none, some = (
-        lv.solve_qp(lv.Problem.from_qp(**program, h=[-1.0, side, 1.0]), solver, tol=tol) for side in (-1.0, 1.0)
+        lv.solve_qp(lv.Problem.from_qp(**program, h=[-1.0, side, 1.0]), solver, tol=tol)
+        for side in (-1.0, 1.0)
     )
     assert none.ray is None and not none.found
     assert some.ray is not None and not some.found
@@ -255,20 +286,31 @@ def test_infeasible_program_is_never_called_unbounded(solver, tol):
 
 # -- a singular P ----------------------------------------------------------------------------------
 
-SINGULAR = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, 1.0], G=[[1.0, 1.0]], h=[1.0], lb=[-4.0, -4.0])
+SINGULAR = lv.Problem.from_qp(
+    np.diag([1.0, 0.0]), [1.0, 1.0], G=[[1.0, 1.0]], h=[1.0], lb=[-4.0, -4.0]
+)
 BACKENDS = [name for name in lv.available(SINGULAR) if name != "auto"]
 
 
 def test_solve_qp_with_a_singular_p_runs_a_backend_that_is_named():
     P = np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
-    problem = lv.Problem.from_qp(P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat")
+    problem = lv.Problem.from_qp(
+        P, [-1.0, -1.0, 1.0], A=[[1.0, 1.0, 1.0]], b=[1.0], lb=np.zeros(3), name="flat"
+    )
     assert problem.generalized is None and problem.has_singular_program
     np.testing.assert_array_equal(problem.dense()[:3, :3], P)
     np.testing.assert_array_equal(problem.qp.generalized.mass.toarray(), P)
     first = next(name for name in ("piqp", "clarabel", "osqp") if name in BACKENDS)
-    for solution in (lv.solve(problem, tol=1e-9), lv.solve_qp(problem).solution, lv.prepare(problem).solve()):
+    for solution in (
+        lv.solve(problem, tol=1e-9),
+        lv.solve_qp(problem).solution,
+        lv.prepare(problem).solve(),
+    ):
         assert solution.stages[0].solver == first and first in solution.message
-        assert solution.success and solution.residual.relative == lv.residual(problem, solution.impulse).relative
+        assert (
+            solution.success
+            and solution.residual.relative == lv.residual(problem, solution.impulse).relative
+        )
     plan = lv.explain(problem)
     assert plan.stages[0].solver == first and first in str(plan)
     assert problem.row_name(2) == "variable 2" and problem.row_name(3) == "constraint 0"
@@ -280,7 +322,9 @@ def test_program_is_singular_from_a_pivot_of_1e_13():
         problem = lv.Problem.from_qp([[1.0, beside], [beside, 1.0]], [1.0, 1.0], lb=[-1.0, -1.0])
         assert problem.has_singular_program == is_singular
         assert lv.solve_qp(problem).found
-    tiny = lv.Problem.from_qp(np.diag([1.0, 1e-20]), [1.0, 1e-20])  # each pivot is its diagonal entry
+    tiny = lv.Problem.from_qp(
+        np.diag([1.0, 1e-20]), [1.0, 1e-20]
+    )  # each pivot is its diagonal entry
     assert not tiny.has_singular_program
 
 
@@ -298,13 +342,17 @@ def test_solve_many_and_updated_accept_singular_programs():
 @pytest.mark.parametrize("limit", [1e-6, 5.0])
 def test_solve_qp_of_a_singular_program_ends_at_its_time_limit(limit):
     answer = lv.solve_qp(SINGULAR, time_limit=limit)
-    assert answer.found if limit > 1.0 else answer.solution.status.name in ("TIME_LIMIT", "CONVERGED")
+    assert (
+        answer.found if limit > 1.0 else answer.solution.status.name in ("TIME_LIMIT", "CONVERGED")
+    )
 
 
 @pytest.mark.parametrize(("seed", "n"), [(0, 300), (1, 800)])
 def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
     rng = np.random.default_rng(seed)
-    A = sp.random_array((n // 2, n), density=5.0 / n, rng=rng, data_sampler=lambda size: rng.normal(size=size))
+    A = sp.random_array(
+        (n // 2, n), density=5.0 / n, rng=rng, data_sampler=lambda size: rng.normal(size=size)
+    )
     x = rng.random(n) * (rng.random(n) < 0.5)
     q = A.T @ rng.normal(size=n // 2) + rng.random(n) * (x == 0.0)
     problem = lv.Problem.from_qp(sp.csr_array((n, n)), q, A=A.tocsr(), b=A @ x, lb=np.zeros(n))
@@ -337,7 +385,9 @@ def test_two_rows_over_a_singular_p_that_contradict_each_other_are_infeasible(un
     assert not lv.solve_qp(unit * root @ root.T, np.zeros(11), max_iter=10_000, **rows).found
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
+)
 def test_solve_qp_of_contradicting_rows_among_many_returns_a_proof(seed):
     rng = np.random.default_rng(seed)
     n = 120
@@ -351,7 +401,9 @@ def test_solve_qp_of_contradicting_rows_among_many_returns_a_proof(seed):
     box = {"lb": x - 2.0, "ub": x + 2.0}
     sides = side - 0.1, side + 2.0 * weight @ (h - G @ x)[conflict]
     none, some = (
-        lv.solve_qp(lv.Problem.from_qp(P, rng.normal(size=n), np.vstack([G, last]), np.append(h, at), **box))
+        lv.solve_qp(
+            lv.Problem.from_qp(P, rng.normal(size=n), np.vstack([G, last]), np.append(h, at), **box)
+        )
         for at in sides
     )
     assert none.solution.status is lv.Status.INFEASIBLE and none.solution.claim_check == "confirmed"
@@ -369,7 +421,9 @@ def test_solve_qp_found_holds_to_the_requested_tolerance():
     for n in (3, 10, 30):
         root, rows = rng.normal(size=(n, n)), rng.normal(size=(n, n))
         for p in (root @ root.T, root[:, :2] @ root[:, :2].T):
-            problem = lv.Problem.from_qp(p, rng.normal(size=n), G=rows, h=np.ones(n), lb=-np.ones(n), ub=np.ones(n))
+            problem = lv.Problem.from_qp(
+                p, rng.normal(size=n), G=rows, h=np.ones(n), lb=-np.ones(n), ub=np.ones(n)
+            )
             for tol in (1e-2, 1e-5, 1e-9):
                 answer = lv.solve_qp(problem, tol=tol)
                 assert answer.found and answer.error <= tol
@@ -385,7 +439,9 @@ def test_solve_qp_with_a_contradicted_claim_is_not_found(plug_in):
         impulse[:] = 0.5 * lv.solve(problem, "newton", tol=1e-12).impulse
         return lv.Claim(lv.Status.CONVERGED, 1)
 
-    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e9, 1e9])
+    problem = lv.Problem.from_qp(
+        2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e9, 1e9]
+    )
     answer = lv.solve_qp(problem, plug_in(run))
     assert answer.solution.claim_check == "contradicted" and "CONTRADICTED" in str(answer)
     assert not answer.found and not str(answer).startswith("solved")
@@ -396,13 +452,18 @@ def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_retu
     n = 40
     half = rng.normal(size=(n, n))
     problem = lv.Problem.from_qp(
-        half @ half.T + 1e-6 * np.eye(n), rng.normal(size=n), rng.normal(size=(60, n)), rng.uniform(0.1, 1.0, 60)
+        half @ half.T + 1e-6 * np.eye(n),
+        rng.normal(size=n),
+        rng.normal(size=(60, n)),
+        rng.uniform(0.1, 1.0, 60),
     )
     begin = perf_counter()
     answer = lv.solve_qp(problem, "pgs", tol=1e-15, time_limit=0.05, max_iter=10**8)
     assert answer.solution.status is lv.Status.TIME_LIMIT and perf_counter() - begin < 10.0
     answer = lv.solve_qp(problem, "pgs", tol=1e-12, max_iter=3)
-    assert answer.solution.status is lv.Status.MAX_ITERATIONS and answer.solution.work == {"sweeps": 3}
+    assert answer.solution.status is lv.Status.MAX_ITERATIONS and answer.solution.work == {
+        "sweeps": 3
+    }
     solved = lv.solve_qp(problem)
     for name in ("auto", *installed("osqp", "clarabel")):
         again = lv.solve_qp(problem, name, tol=1e-6, impulse=solved.impulse)
@@ -418,7 +479,9 @@ def test_solve_qp_limits_reach_the_solver_and_a_start_that_is_a_solution_is_retu
         assert "is a solution" not in answer.solution.message, name
 
 
-@pytest.mark.parametrize("solver", ["auto", "newton", *installed("clarabel", "piqp", "daqp", "quadprog", "osqp")])
+@pytest.mark.parametrize(
+    "solver", ["auto", "newton", *installed("clarabel", "piqp", "daqp", "quadprog", "osqp")]
+)
 @pytest.mark.parametrize("h", [[], [1.0, 0.0], [1.0, -1.0]])
 @pytest.mark.parametrize("b", [[], [0.0], [0.0, 1e-3], [-2.0]])
 def test_program_without_variables_is_found_unless_a_row_contradicts_itself(solver, h, b):
@@ -433,7 +496,9 @@ def test_program_without_variables_is_found_unless_a_row_contradicts_itself(solv
 PLACEHOLDERS = [1e4, 1e7, 1e9, 1e12, 1e15, 1e17, 9e19]
 
 
-@pytest.mark.parametrize("name", lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))))
+@pytest.mark.parametrize(
+    "name", lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2)))
+)
 @pytest.mark.parametrize("tol", [1e-6, 1e-9])
 def test_solve_qp_with_placeholder_bounds_fulfils_its_equation(name, tol):
     """(x - 2)^2 + (y - 1)^2 with x + y = 1 is least at (1, 0); (2, 1) was found, or x off by 1.7."""
@@ -451,7 +516,9 @@ def test_solve_qp_with_placeholder_bounds_fulfils_its_equation(name, tol):
 
 def test_solve_qp_error_ignores_the_multiplier_of_a_far_row():
     """The gap of 1e-4 of a multiplier of 1e-10 at a bound of 1e6 is a residual, and the point is a solution."""
-    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6])
+    problem = lv.Problem.from_qp(
+        2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6]
+    )
     impulse = lv.solve_qp(problem, "newton", tol=1e-12).impulse.copy()
     impulse[-1] = 1e-10
     answer = problem.qp.solution(impulse, 1e-9)
@@ -463,7 +530,12 @@ def test_solve_qp_violation_of_cancelling_terms_is_relative_to_their_sum():
     """A second difference of 1e7 - 2e7 + 1e7 is violated by 0.5, which is 2.5e-8 of the sum of its terms."""
     difference = 1000.0 * np.array([[1.0, -2.0, 1.0]])
     problem = lv.Problem.from_qp(
-        np.zeros((3, 3)), [1.0, -2.0, 0.0], G=-difference, h=[1.0], A=[[0, 0, 1.0], [1.0, 0, 0]], b=[5e3, 5e3]
+        np.zeros((3, 3)),
+        [1.0, -2.0, 0.0],
+        G=-difference,
+        h=[1.0],
+        A=[[0, 0, 1.0], [1.0, 0, 0]],
+        b=[5e3, 5e3],
     )
     answer = lv.solve_qp(problem)
     np.testing.assert_allclose(answer.x, 5e3, rtol=1e-6)

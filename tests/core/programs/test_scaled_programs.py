@@ -11,14 +11,21 @@ BASES = list(list_programs(3))
 BY_NAME = {base.name: base for base in BASES}
 
 
-@pytest.mark.parametrize("name", installed("osqp", "clarabel", "piqp", "proxqp", "daqp", "quadprog", "highs", "scs"))
+@pytest.mark.parametrize(
+    "name", installed("osqp", "clarabel", "piqp", "proxqp", "daqp", "quadprog", "highs", "scs")
+)
 @pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_backend_solves_scaled_copies_and_makes_no_false_claim(name, half):
     bases = BASES[half::2]
     counts, failures = run_backend(name, bases)
     assert counts["solves"] == 13 * sum(base.x is not None for base in bases) >= 13 * 6
     assert counts["right and found"] >= 0.99 * counts["solves"], failures
-    for column in ("wrong and found", "false INFEASIBLE or UNBOUNDED", "found differs from CONVERGED", "contradicted"):
+    for column in (
+        "wrong and found",
+        "false INFEASIBLE or UNBOUNDED",
+        "found differs from CONVERGED",
+        "contradicted",
+    ):
         assert counts[column] == 0, failures
     assert counts["not proved"] == 0, failures
 
@@ -28,7 +35,9 @@ def test_auto_solves_scaled_copies():
     assert counts["right and found"] == counts["solves"] and counts["proved"] == 26, failures
 
 
-@pytest.mark.parametrize("base", [base for base in BASES if base.kind == "x"], ids=lambda base: base.name)
+@pytest.mark.parametrize(
+    "base", [base for base in BASES if base.kind == "x"], ids=lambda base: base.name
+)
 def test_solve_qp_error_is_the_same_in_all_units(base):
     """Errors are equal up to the rounding that the judge subtracts, which depends on the scales of the variables."""
     wrong = base.x + 1e-3 * np.random.default_rng(0).normal(size=len(base.x))
@@ -100,15 +109,36 @@ EDGE_CASES = [
     ("CONVERGED", {"P": np.eye(3), "q": [1e12, -1e12, 1.0], "lb": [-1.0] * 3, "ub": [1.0] * 3}),
     ("UNBOUNDED", {"P": np.zeros((2, 2)), "q": [1.0, 0.0]}),
     ("UNBOUNDED", {"P": np.diag([1.0, 0.0]), "q": [1.0, 1.0]}),
-    ("INFEASIBLE", {"P": np.diag([1.0, 0.0]), "q": [1.0, -1.0], "G": [[1.0, 0.0], [-1.0, 0.0]], "h": [-1.0, -1.0]}),
+    (
+        "INFEASIBLE",
+        {
+            "P": np.diag([1.0, 0.0]),
+            "q": [1.0, -1.0],
+            "G": [[1.0, 0.0], [-1.0, 0.0]],
+            "h": [-1.0, -1.0],
+        },
+    ),
     ("INFEASIBLE", {"P": np.eye(2), "q": [1.0, 1.0], "G": [[0.0, 0.0]], "h": [-1.0]}),
 ]
 
 
 @pytest.mark.parametrize(("status", "arrays"), EDGE_CASES)
 def test_programs_at_the_edges_have_one_verdict(status, arrays):
-    names = ("osqp", "clarabel", "piqp", "daqp", "quadprog", "highs", "scs", "qpalm", "cvxopt", "ecos")
+    names = (
+        "osqp",
+        "clarabel",
+        "piqp",
+        "daqp",
+        "quadprog",
+        "highs",
+        "scs",
+        "qpalm",
+        "cvxopt",
+        "ecos",
+    )
     for name in ("auto", *(name for name in names if lv.registry.specs()[name].missing() is None)):
         answer = lv.solve_qp(**arrays, solver=name, tol=1e-6)
         assert answer.solution.status.name == status, (name, str(answer))
-        assert answer.found == (status == "CONVERGED") == (answer.error <= 1e-6 and answer.ray is None), name
+        assert (
+            answer.found == (status == "CONVERGED") == (answer.error <= 1e-6 and answer.ray is None)
+        ), name

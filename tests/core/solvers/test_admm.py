@@ -12,12 +12,16 @@ from lavender.solvers import admm
 
 @pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
 def test_admm_with_every_factorisation_gives_the_same_impulse(law):
-    base = random_contact_problem(51, friction="cone" if law == "cone" else "coulomb", contacts=14, bodies=4)
+    base = random_contact_problem(
+        51, friction="cone" if law == "cone" else "coulomb", contacts=14, bodies=4
+    )
     cones = base.cones
     if law == "linear":
         cones = lv.Cones.free(base.m)
     elif law == "lcp":
-        cones = lv.Cones.bounded(np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf))
+        cones = lv.Cones.bounded(
+            np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf)
+        )
     a = base.dense() + 0.3 * np.eye(base.m)
     problem = lv.Problem(base.b, cones, a, friction=base.friction)
     assert problem.law == law
@@ -25,7 +29,12 @@ def test_admm_with_every_factorisation_gives_the_same_impulse(law):
     assert dense.solver.form == "Cholesky"
     results = [dense]
     slightly = a + 1e-13 * np.abs(a).max() * np.triu(np.ones_like(a), 1)
-    lu = lv.solve(lv.Problem(base.b, cones, slightly, friction=base.friction), "admm", tol=1e-10, max_iter=20_000)
+    lu = lv.solve(
+        lv.Problem(base.b, cones, slightly, friction=base.friction),
+        "admm",
+        tol=1e-10,
+        max_iter=20_000,
+    )
     assert lu.solver.form == "LU"
     results.append(lu)
     # Eight of them side by side make a matrix of few entries.
@@ -34,15 +43,21 @@ def test_admm_with_every_factorisation_gives_the_same_impulse(law):
     for solution in results:
         assert solution.success
         # Eigenvalues of A from 0.3 to about 30.
-        np.testing.assert_allclose(solution.impulse, dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
+        np.testing.assert_allclose(
+            solution.impulse, dense.impulse, atol=1e-7 * np.abs(dense.impulse).max()
+        )
     assert eight.success
-    np.testing.assert_allclose(eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
+    np.testing.assert_allclose(
+        eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max()
+    )
 
 
 def test_factor_after_breakdown_of_panels_is_full_and_ends_at_the_deadline(clock):
     # A chain of whose diagonal rho = 0.1 leaves nothing: every pivot is a neighbour's.
     m = 60
-    a = sp.diags_array([np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1])
+    a = sp.diags_array(
+        [np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1]
+    )
     problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
     prepared = lv.prepare(problem, "admm")
     state = prepared.state
@@ -73,7 +88,9 @@ def test_admm_without_memory_equals_plain_admm_by_hand():
         y = rho * (u - z)
         x = inverse @ (c + rho * z - y)
         got = lv.solve(problem, "admm", memory=0, tol=0.0, max_iter=n)
-        np.testing.assert_allclose(got.impulse, z / root, rtol=1e-10, atol=1e-12)  # the inverse loses some digits
+        np.testing.assert_allclose(
+            got.impulse, z / root, rtol=1e-10, atol=1e-12
+        )  # the inverse loses some digits
         u = u + 1.6 * (x - z)
 
 

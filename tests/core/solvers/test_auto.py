@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import FORMS, as_matrix, random_contact_problem, random_generalized_problem, seeds, side_by_side
+from random_problems import (
+    FORMS,
+    as_matrix,
+    random_contact_problem,
+    random_generalized_problem,
+    seeds,
+    side_by_side,
+)
 
 import lavender as lv
 from lavender.solvers.islands import find_islands, get_rows_of_blocks, restrict_to_blocks
@@ -14,7 +21,9 @@ from lavender.solvers.newton import Newton
 @given(seed=seeds)
 def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
     rolls = bool(seed % 2)
-    problem = FORMS[form](random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6))
+    problem = FORMS[form](
+        random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6)
+    )
     if form == "J and M" and rolls:  # Some velocities of these trees have no rows.
         problem = random_generalized_problem(seed, "coulomb", n=30, contacts=3)
     count, label = find_islands(problem)
@@ -31,12 +40,18 @@ def test_restrict_to_islands_gives_blocks_of_the_matrix(form, seed):
         part = restrict_to_blocks(problem, blocks, rows)
         assert part.operator == problem.operator
         # Sums over one body in another order: a few roundings.
-        np.testing.assert_allclose(part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max())
+        np.testing.assert_allclose(
+            part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max()
+        )
         np.testing.assert_array_equal(part.b, problem.b[rows])
-        assert [part.block_name(j) for j in range(len(blocks))] == [problem.block_name(int(j)) for j in blocks]
+        assert [part.block_name(j) for j in range(len(blocks))] == [
+            problem.block_name(int(j)) for j in blocks
+        ]
         if problem.rows is not None:
             bodies = np.unique(problem.rows.block_bodies[blocks])
-            np.testing.assert_array_equal(part.rows.v_free, problem.rows.v_free[bodies[bodies >= 0]])
+            np.testing.assert_array_equal(
+                part.rows.v_free, problem.rows.v_free[bodies[bodies >= 0]]
+            )
         alone = lv.residual(part, lam[rows]).error
         whole = lv.residual(problem, lam).error[rows]
         np.testing.assert_allclose(alone, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
@@ -52,7 +67,9 @@ def test_auto_solves_a_resting_pile_by_its_relaxation():
 
 
 def test_auto_admm_from_relaxation_solves_pyramid_with_slip():
-    problem = lv.suite.case("pyramidF(k=10)").problem  # The relaxation has the residual 6e-2 under Coulomb's law.
+    problem = lv.suite.case(
+        "pyramidF(k=10)"
+    ).problem  # The relaxation has the residual 6e-2 under Coulomb's law.
     solution = lv.solve(problem, "auto", tol=1e-6)
     work = {stage.solver: stage.work for stage in solution.stages}
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
@@ -97,12 +114,18 @@ def test_fraction_near_sliding_of_interior_point_equals_that_of_its_impulses():
 
 def test_auto_continues_only_with_islands_that_the_relaxation_has_not_solved():
     """Beside a pile that rests, a pyramid that slips takes about as many factorisations as alone."""
-    pile, pyramid = (lv.suite.case(name).problem for name in ("granularF(n=6)", "pyramidF(k=6, sliding=0.5)"))
+    pile, pyramid = (
+        lv.suite.case(name).problem for name in ("granularF(n=6)", "pyramidF(k=6, sliding=0.5)")
+    )
     problem = side_by_side([pile, pyramid])
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success and lv.residual(problem, solution.impulse).relative <= 1e-6
-    sweeps = [s.work["sweeps"] for s in solution.stages if s.solver == "anderson" and s.before > 0.1]
-    assert sum(sweeps) <= 128  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
+    sweeps = [
+        s.work["sweeps"] for s in solution.stages if s.solver == "anderson" and s.before > 0.1
+    ]
+    assert (
+        sum(sweeps) <= 128
+    )  # The pile needs fewer than 128; the sweeps end when half of the blocks are solved.
 
 
 def test_auto_with_stages_left_out_for_lack_of_time_ends_with_the_status_time_limit(monkeypatch):

@@ -64,7 +64,8 @@ def gear_train(contact, force=1e5, ratio=3.0, wheels=7):
     unit = np.eye(nv)
     hinges = [unit[3 * i + k] for i in range(wheels) for k in (0, 1)]
     gears = [
-        ratio * unit[3 * i + 2] - unit[3 * i + 5] + 0.1 * (unit[3 * i + 1] - unit[3 * i + 4]) for i in range(wheels - 1)
+        ratio * unit[3 * i + 2] - unit[3 * i + 5] + 0.1 * (unit[3 * i + 1] - unit[3 * i + 4])
+        for i in range(wheels - 1)
     ]
     free = len(hinges) + len(gears)
     limit = np.r_[np.full(free, np.inf), force * dt]
@@ -77,7 +78,9 @@ def gear_train(contact, force=1e5, ratio=3.0, wheels=7):
         cones = cones + lv.Cones.contacts([0.5])
     v = np.zeros(nv)
     v[1::3] = -9.81 * dt
-    return lv.Problem.from_jacobian(np.array(rows), np.diag([1.0, 1.0, 0.01] * wheels), v, target=target, cones=cones)
+    return lv.Problem.from_jacobian(
+        np.array(rows), np.diag([1.0, 1.0, 0.01] * wheels), v, target=target, cones=cones
+    )
 
 
 @pytest.mark.parametrize("contact", [False, True])
@@ -95,7 +98,9 @@ def test_sweeps_under_coulomb_law_return_the_last_iterate(name):
     for seed in range(10):
         problem = random_contact_problem(seed)
         for sweeps in (1, 3, 10):
-            solution, last = (lv.solve(problem, name, tol=tol, max_iter=sweeps) for tol in (1e-13, 0.0))
+            solution, last = (
+                lv.solve(problem, name, tol=tol, max_iter=sweeps) for tol in (1e-13, 0.0)
+            )
             if find_islands(problem)[0] == 1 and not solution.success:
                 np.testing.assert_array_equal(solution.impulse, last.impulse)
 
@@ -104,7 +109,9 @@ def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
     problem = lv.Problem.lcp(np.diag([1.0, 1.0]) + np.array([[0.0, 0.0], [0.0, 0.0]]), [1.0, 1.0])
     assert find_islands(problem)[0] == 2
     kept = lv.solve(problem, "jacobi", impulse=[0.9, 1e6], tol=1e-30, max_iter=0)
-    np.testing.assert_array_equal(kept.impulse, [0.9, 1e6])  # Without an iteration nothing is judged.
+    np.testing.assert_array_equal(
+        kept.impulse, [0.9, 1e6]
+    )  # Without an iteration nothing is judged.
     history = []
     lv.solve(
         lv.Problem.lcp(np.array([[2.0, 1.0, 0], [1.0, 2.0, 0], [0, 0, 1.0]]), [1.0, 1.0, 1.0]),
@@ -117,7 +124,11 @@ def test_sweeps_stale_start_begin_at_zero_in_that_island_alone():
     assert np.abs(history[1][:2]).max() < 10.0
     # With tol = 0 the start is kept: one iteration of Jacobi's method depends on it.
     exact = lv.solve(
-        lv.Problem.lcp([[1.0, 0.5], [0.5, 1.0]], [1.0, 1.0]), "pgs", impulse=[0.0, 1e6], tol=0.0, max_iter=1
+        lv.Problem.lcp([[1.0, 0.5], [0.5, 1.0]], [1.0, 1.0]),
+        "pgs",
+        impulse=[0.0, 1e6],
+        tol=0.0,
+        max_iter=1,
     )
     assert exact.impulse[0] == 0.0 and exact.impulse[1] == 1.0
 
@@ -141,19 +152,30 @@ def test_combine_best_islands_takes_the_smallest_objective_of_each_island(seed):
     near = lv.solve(problem, tol=1e-9).impulse
     points = np.vstack([near * rng.uniform(0.3, 1.5, (4, 3 * size)), problem.start()])
     values = [
-        [0.5 * x @ matrix @ x - b @ x for (matrix, b), x in zip(blocks, np.split(point, 3), strict=True)]
+        [
+            0.5 * x @ matrix @ x - b @ x
+            for (matrix, b), x in zip(blocks, np.split(point, 3), strict=True)
+        ]
         for point in points
     ]
-    found = combine_best_islands(problem, points[0], list(points[1:4]), 1e-12)  # The last is always compared, too.
+    found = combine_best_islands(
+        problem, points[0], list(points[1:4]), 1e-12
+    )  # The last is always compared, too.
     best = np.argmin(values, axis=0)
-    np.testing.assert_array_equal(found, np.concatenate([np.split(points[i], 3)[k] for k, i in enumerate(best)]))
+    np.testing.assert_array_equal(
+        found, np.concatenate([np.split(points[i], 3)[k] for k, i in enumerate(best)])
+    )
 
 
 def preloaded_problem(seed, law, rhs_size):
     """Rows under preload (a fixed force, a motor between two torques, belts under tension), and contacts or bounds."""
     rng = np.random.default_rng(seed)
     fixed = lv.Cones.bounded([1.0, 0.5, 2.0, 1.0], [1.0, 1.5, np.inf, np.inf])
-    rest = lv.Cones.bounded(np.zeros(9), np.full(9, np.inf)) if law == "lcp" else lv.Cones.contacts(np.full(3, 0.5))
+    rest = (
+        lv.Cones.bounded(np.zeros(9), np.full(9, np.inf))
+        if law == "lcp"
+        else lv.Cones.contacts(np.full(3, 0.5))
+    )
     cones = fixed + rest
     jac = rng.standard_normal((len(cones.lower), 16))
     free = rng.standard_normal(16)
@@ -167,7 +189,9 @@ DECADES = [*range(0, 20, 3), np.inf]
 
 @pytest.mark.parametrize("law", ["lcp", "cone", "coulomb"])
 @pytest.mark.parametrize("name", [*SWEEPS, "jacobi", "apgd", "admm"])
-def test_solve_bounds_exclude_zero_returns_no_iterate_worse_than_its_last_for_any_size_of_b(name, law):
+def test_solve_bounds_exclude_zero_returns_no_iterate_worse_than_its_last_for_any_size_of_b(
+    name, law
+):
     for decade in DECADES:
         problem = preloaded_problem(int(min(decade, 20.0)), law, 10.0**-decade)
         if name not in lv.available(problem):
@@ -175,7 +199,11 @@ def test_solve_bounds_exclude_zero_returns_no_iterate_worse_than_its_last_for_an
         for sweeps in (3, 10, 200):
             seen = []
             found = lv.solve(
-                problem, name, tol=1e-17, max_iter=sweeps, callback=lambda n, x, r, seen=seen: seen.append(x.copy())
+                problem,
+                name,
+                tol=1e-17,
+                max_iter=sweeps,
+                callback=lambda n, x, r, seen=seen: seen.append(x.copy()),
             )
             assert found.claim_check == "confirmed"
             last, now = (lv.residual(problem, x) for x in (seen[-1], found.impulse))

@@ -40,17 +40,27 @@ def test_block_gauss_seidel_solves_separate_joints_in_one_sweep(rows, matrix):
     zero = np.zeros(n)
     low, high = np.where(rng.random((2, n * rows)) < 0.3, np.inf, reach) * [[-1.0], [1.0]]
     cones = lv.Cones(rows * np.arange(n + 1), np.zeros(n, int), low, high, zero, zero)
-    problem = lv.Problem(rng.standard_normal(n * rows), cones, sp.block_diag(list(map(sp.coo_array, w)), format="csr"))
+    problem = lv.Problem(
+        rng.standard_normal(n * rows),
+        cones,
+        sp.block_diag(list(map(sp.coo_array, w)), format="csr"),
+    )
     found = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1)
     assert found.work["fallbacks"] == 0
-    assert found.residual.relative <= 1e-12 + 10.0 * found.residual.roundoff_floor  # a few roundings
+    assert (
+        found.residual.relative <= 1e-12 + 10.0 * found.residual.roundoff_floor
+    )  # a few roundings
 
 
 def test_block_gauss_seidel_solves_dependent_rows_of_a_joint():
     # A redundant row twice in one block, and a block that contradicts itself: the best of it, finite.
     a = np.array([[2.0, 2.0, 0.3], [2.0, 2.0, 0.3], [0.3, 0.3, 1.0]])
-    cones = lv.Cones(np.array([0, 3]), np.zeros(1, int), np.full(3, -np.inf), np.full(3, np.inf), [0.0], [0.0])
-    solution = lv.solve(lv.Problem(np.array([1.0, 1.0, 0.5]), cones, a), "block_gauss_seidel", tol=1e-12)
+    cones = lv.Cones(
+        np.array([0, 3]), np.zeros(1, int), np.full(3, -np.inf), np.full(3, np.inf), [0.0], [0.0]
+    )
+    solution = lv.solve(
+        lv.Problem(np.array([1.0, 1.0, 0.5]), cones, a), "block_gauss_seidel", tol=1e-12
+    )
     assert solution.success
     contradiction = lv.solve(lv.Problem(np.array([1.0, 2.0, 0.5]), cones, a), "block_gauss_seidel")
     assert np.isfinite(contradiction.impulse).all()
@@ -63,7 +73,9 @@ def test_block_gauss_seidel_sweeps_blocks_of_many_rows_row_by_row():
     m = 12
     g = rng.standard_normal((m, 2 * m))
     a = g @ g.T
-    cones = lv.Cones(np.array([0, m]), np.zeros(1, int), np.zeros(m), np.full(m, np.inf), [0.0], [0.0])
+    cones = lv.Cones(
+        np.array([0, m]), np.zeros(1, int), np.zeros(m), np.full(m, np.inf), [0.0], [0.0]
+    )
     problem = lv.Problem(rng.standard_normal(m), cones, a)
     solution = lv.solve(problem, "block_gauss_seidel", tol=1e-10, max_iter=20_000)
     assert solution.success
@@ -77,7 +89,12 @@ MATRICES = ("full", "asymmetric", "diag(1, 100)", "rank one", "condition 1e6")
 @pytest.mark.parametrize("matrix", MATRICES)
 @pytest.mark.parametrize(
     ("kind", "law"),
-    [(kind, law) for kind in CONES for law in ("coulomb", "cone") if (kind, law) != ("round", "coulomb")],
+    [
+        (kind, law)
+        for kind in CONES
+        for law in ("coulomb", "cone")
+        if (kind, law) != ("round", "coulomb")
+    ],
 )
 def test_block_gauss_seidel_solves_separate_contacts_in_one_sweep(kind, law, matrix):
     """As many as no other meets, by the judge's error of each; what no exact answer is found for is counted."""

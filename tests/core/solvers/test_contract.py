@@ -27,12 +27,16 @@ REQUIRED_BACKENDS = ("osqp", "clarabel", "piqp", "daqp", "clarabel_cone")
 
 def mark_external(names):
     """Mark backends as slow: in the tests with sanitizers they take long and run no kernel of this package."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * registry.get(name).external) for name in names]
+    return [
+        pytest.param(name, marks=[pytest.mark.slow] * registry.get(name).external) for name in names
+    ]
 
 
 @pytest.mark.parametrize("name", mark_external(lv.available()))
 def test_solver_meets_the_contract(name):
-    failures = {check.name: failure.text for check, failure in contract.check_solver(name) if failure.text}
+    failures = {
+        check.name: failure.text for check, failure in contract.check_solver(name) if failure.text
+    }
     assert not failures
 
 
@@ -49,17 +53,26 @@ def test_solver_solves_every_kind_of_problem_in_every_form(name):
             budget = max(spec.max_iter, 20_000) if spec.resumable else None
             solution = lv.solve(problem, name, tol=tol, max_iter=budget)
             if spec.external and (name not in REQUIRED_BACKENDS or kind.startswith("round")):
-                assert solution.success or solution.status_conflict or solution.status != "CONVERGED"
+                assert (
+                    solution.success or solution.status_conflict or solution.status != "CONVERGED"
+                )
                 continue
             assert solution.success and solution.claim_check == "confirmed", (law, kind, solution)
-            if law != "coulomb":  # The slack is unique; an impulse error of tol moves it by at most 1e3 times as much.
+            if (
+                law != "coulomb"
+            ):  # The slack is unique; an impulse error of tol moves it by at most 1e3 times as much.
                 size = np.abs(problem.slack(problem.start())).max()
                 np.testing.assert_allclose(
-                    solution.slack, slack, rtol=0, atol=1e3 * tol * size + 1e-7 * np.abs(slack).max()
+                    solution.slack,
+                    slack,
+                    rtol=0,
+                    atol=1e3 * tol * size + 1e-7 * np.abs(slack).max(),
                 )
 
 
-SOFT = touching([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))  # a body that cannot move
+SOFT = touching(
+    [[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3))
+)  # a body that cannot move
 UNUSUAL = {
     "no rows, linear": lv.Problem.linear(np.zeros((0, 0)), []),
     "one free row": lv.Problem.linear([[2.0]], [1.0]),
@@ -72,7 +85,9 @@ UNUSUAL = {
     "a zero diagonal": lv.Problem.lcp([[0.0, 1.0], [1.0, 0.0]], [1.0, 1.0]),
     "an indefinite A": lv.Problem.lcp([[-1.0, 2.0], [2.0, -1.0]], [1.0, 1.0]),
     "an asymmetric A": lv.Problem.lcp([[2.0, 1.0], [-1.0, 2.0]], [1.0, 1.0]),
-    "tangents that cannot move": lv.Problem.contact(np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]),
+    "tangents that cannot move": lv.Problem.contact(
+        np.diag([1.0, 0.0, 0.0]), [1.0, 0.2, 0.1], [0.5]
+    ),
     "soft contacts of a static body": lv.Problem.from_rows(
         SOFT, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0]
     ),
@@ -106,11 +121,16 @@ def test_claims_about_small_matrices_are_true(name, seed, m):
 @pytest.mark.parametrize("name", [name for name in OURS if registry.get(name).impulse])
 def test_solver_under_the_cone_law_keeps_friction_of_a_normal_without_inverse_mass(name):
     """The solution has w_n = mu |w_t| > 0 and lambda_n > 0."""
-    b, impulse = np.array([-0.5, 2.0, 0.0]), np.array([2.0, 1.0, 0.0])  # The slack is w = (0.5, -1, 0) m/s.
+    b, impulse = (
+        np.array([-0.5, 2.0, 0.0]),
+        np.array([2.0, 1.0, 0.0]),
+    )  # The slack is w = (0.5, -1, 0) m/s.
     one = lv.Cones.contacts([0.5])
     for problem in (
         lv.Problem.contact(np.diag([0.0, 1.0, 1.0]), b, [0.5], friction="cone"),
-        lv.Problem.from_jacobian(np.eye(3)[:, 1:], np.eye(2), [0, 0], target=b, cones=one, friction="cone"),
+        lv.Problem.from_jacobian(
+            np.eye(3)[:, 1:], np.eye(2), [0, 0], target=b, cones=one, friction="cone"
+        ),
     ):
         if registry.get(name).refuses(problem) is None:
             kept = lv.solve(problem, name, tol=1e-9, impulse=impulse)
@@ -153,7 +173,9 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
 BROKEN = [MemoryError("8 GB"), TooLarge("A would have 1e10 entries"), FloatingPointError("1e400")]
 
 
-@pytest.mark.parametrize("error", [*BROKEN, KeyboardInterrupt()], ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize(
+    "error", [*BROKEN, KeyboardInterrupt()], ids=lambda error: type(error).__name__
+)
 @pytest.mark.parametrize("name", [name for name in OURS if name != "auto"])
 def test_solver_that_raises_after_the_start_gives_a_result(name, error, monkeypatch):
     """With the best impulse so far, and never one that is worse than the start."""
@@ -197,7 +219,9 @@ def test_auto_continues_with_other_solvers_after_an_exception(limit, error, monk
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
             monkeypatch.setattr(kind, "advance", breaks)
-        found = lv.solve(problem, tol=1e-13, time_limit=limit)  # the compiled call leaves that to the others
+        found = lv.solve(
+            problem, tol=1e-13, time_limit=limit
+        )  # the compiled call leaves that to the others
         ran = {stage.solver for stage in found.stages if stage.work}
         if len(broken) == 1:
             assert found.residual.relative <= 1e-6
@@ -209,7 +233,9 @@ def test_auto_continues_with_other_solvers_after_an_exception(limit, error, monk
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_solver_on_an_a_beyond_memory_raises_before_the_start_or_does_not_form_it(name, monkeypatch):
+def test_solver_on_an_a_beyond_memory_raises_before_the_start_or_does_not_form_it(
+    name, monkeypatch
+):
     monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 4000)  # J and M have 2,700
     spec = registry.get(name)
     rng = np.random.default_rng(4)
@@ -218,7 +244,11 @@ def test_solver_on_an_a_beyond_memory_raises_before_the_start_or_does_not_form_i
     chain = 0.2 * (np.eye(15, k=1) + np.eye(15, k=-1))
     for friction in ("coulomb", "cone"):
         problem = lv.Problem.from_jacobian(
-            jac, mass + chain, rng.normal(size=15), cones=lv.Cones.contacts(0.5, count=30), friction=friction
+            jac,
+            mass + chain,
+            rng.normal(size=15),
+            cones=lv.Cones.contacts(0.5, count=30),
+            friction=friction,
         )
         if spec.refuses(problem) is not None:
             continue

@@ -19,7 +19,9 @@ class State:
     b: np.ndarray
     cones: lv.Cones
     done: int = 0
-    step: dict[int, float] = field(default_factory=dict)  # [kg] Steps of friction components by their first row.
+    step: dict[int, float] = field(
+        default_factory=dict
+    )  # [kg] Steps of friction components by their first row.
 
     @cached_property
     def units(self):
@@ -54,7 +56,11 @@ class Sweeps:
 
     def update(self, state, problem):
         new = self.prepare(problem)
-        kept = {"update keeps A": ("A",), "update keeps b": ("b",), "update keeps the blocks": ("cones",)}
+        kept = {
+            "update keeps A": ("A",),
+            "update keeps b": ("b",),
+            "update keeps the blocks": ("cones",),
+        }
         if self.mistake == "update keeps the coefficients":
             new.cones = replace(new.cones, mu=state.cones.mu)
         if self.mistake == "update keeps the bounds":
@@ -130,7 +136,11 @@ class Sweeps:
         return self.claim(lv.Status.MAX_ITERATIONS, n)
 
     def claim(self, status, n):
-        work = {"sweeps": 1 if self.mistake == "counts one sweep" else n + (self.mistake == "stops at two")}
+        work = {
+            "sweeps": 1
+            if self.mistake == "counts one sweep"
+            else n + (self.mistake == "stops at two")
+        }
         if self.mistake in ("counts no work", "counts passes"):
             work = {"passes": n} if self.mistake == "counts passes" else {}
         return lv.Claim(status, n, work, "the error grew" if status is lv.Status.DIVERGED else "")
@@ -144,7 +154,9 @@ class Sweeps:
                 high = 0.0 if m == "an upper bound below zero is zero" and high < 0.0 else high
                 high = np.inf if m == "upper bounds are ignored" else high
                 low = -high if m == "bounds are symmetric" and 0.0 < high < np.inf else low
-                x[first] = min(max(low, x[first] - (A[first] @ x - b[first]) / state.problem.d[first]), high)
+                x[first] = min(
+                    max(low, x[first] - (A[first] @ x - b[first]) / state.problem.d[first]), high
+                )
                 continue
             x[first] = max(0.0, x[first] - (A[first] @ x - b[first]) / A[first, first])
             for rows, bound in self.components(c, i):
@@ -161,7 +173,13 @@ class Sweeps:
         """Yield rows and bound per unit of the normal impulse of each friction component of contact i."""
         m = self.mistake
         first = c.ptr[i]
-        mu, radius, nt, spin, roll = c.mu[i], c.patch_radius[i], c.n_tangents[i], c.spin_rows[i], c.rolling_rows[i]
+        mu, radius, nt, spin, roll = (
+            c.mu[i],
+            c.patch_radius[i],
+            c.n_tangents[i],
+            c.spin_rows[i],
+            c.rolling_rows[i],
+        )
         if m == "coefficients are at most one":
             mu = min(mu, 1.0)
         if m == "tangents are ignored for coefficients above one" and mu > 1.0:
@@ -179,7 +197,10 @@ class Sweeps:
         elif nt:
             yield np.arange(first + 1, first + 1 + nt), mu
         if spin >= 0 and m != "spin is ignored":
-            yield np.array([spin]), mu * (1.0 if m == "spin is bounded without its radius" else radius)
+            yield (
+                np.array([spin]),
+                mu * (1.0 if m == "spin is bounded without its radius" else radius),
+            )
         if roll >= 0 and m != "rolling is ignored":
             yield np.arange(roll, roll + 2), mu if m == "rolling is bounded by mu" else c.rolling[i]
 
@@ -266,18 +287,34 @@ class WithOption(Sweeps):
 
 #: Mistake of a solver of bounded rows, the check that must fail, and words of its sentence.
 FAULTS = [
-    ("stops by one norm over all rows", "problems_are_solved", "for two islands whose b differ by 1e6 (law lcp) the"),
-    ("solves with (A + A^T)/2", "problems_are_solved", "for an asymmetric A (law lcp) the result is"),
+    (
+        "stops by one norm over all rows",
+        "problems_are_solved",
+        "for two islands whose b differ by 1e6 (law lcp) the",
+    ),
+    (
+        "solves with (A + A^T)/2",
+        "problems_are_solved",
+        "for an asymmetric A (law lcp) the result is",
+    ),
     ("rounds to single precision", "problems_are_solved", "CONVERGED and lv.residual"),
     ("shares the matrices of problems of one size", "problems_are_solved", "the result is"),
-    ("leaves out rows whose b is below a thousandth of the largest", "problems_are_solved", "islands whose b differ"),
+    (
+        "leaves out rows whose b is below a thousandth of the largest",
+        "problems_are_solved",
+        "islands whose b differ",
+    ),
     ("fails without a message", "problems_are_solved", "A failure has no message"),
     ("rejects rows of zeros", "problems_are_solved", "a row of A is zero"),
     ("needs a row", "problems_are_solved", "was raised in"),
     ("counts passes", "problems_are_solved", "Its work must count one of backend_calls"),
     ("spends two iterations", "budgets_are_kept", "max_iter=1"),
     ("stops at two", "budgets_are_kept", "or the claim"),
-    ("stops at two", "interruptions_return_the_iterate", "TIME_LIMIT after at least 1 iteration is required"),
+    (
+        "stops at two",
+        "interruptions_return_the_iterate",
+        "TIME_LIMIT after at least 1 iteration is required",
+    ),
     ("ignores the order", "orders_change_the_sweep", "give the same bits after 2 sweeps"),
     ("ignores the seed", "orders_change_the_sweep", "give the same bits after 2 sweeps"),
 ]
@@ -287,8 +324,12 @@ def failure(spec, name):
     return find_failure(spec, contract.CHECKS[name]).text
 
 
-@pytest.mark.parametrize("mistake, check, words", FAULTS, ids=[f"{mistake}-{check}" for mistake, check, _ in FAULTS])
-def test_contract_of_a_faulty_solver_names_the_unmet_check(register, monkeypatch, mistake, check, words):
+@pytest.mark.parametrize(
+    "mistake, check, words", FAULTS, ids=[f"{mistake}-{check}" for mistake, check, _ in FAULTS]
+)
+def test_contract_of_a_faulty_solver_names_the_unmet_check(
+    register, monkeypatch, mistake, check, words
+):
     monkeypatch.setattr(Sweeps, "mistake", mistake)
     register(OF_ROWS)
     sentence = failure(OF_ROWS, check)
@@ -299,14 +340,26 @@ def test_contract_of_a_faulty_solver_names_the_unmet_check(register, monkeypatch
 @pytest.mark.parametrize(
     "check, more, words",
     [
-        ("options_match_the_spec", {"options": {"omega": "a factor"}}, "the options omega are in the spec or"),
-        ("options_match_the_spec", {"factory": WithOption}, "the options extra are in the spec or in"),
+        (
+            "options_match_the_spec",
+            {"options": {"omega": "a factor"}},
+            "the options omega are in the spec or",
+        ),
+        (
+            "options_match_the_spec",
+            {"factory": WithOption},
+            "the options extra are in the spec or in",
+        ),
         (
             "problems_are_solved",
             {"laws": {"lcp", "cone"}, "refusal": lambda p: "no" * (p.law == "cone")},
             "the spec lists the law cone, but refuses every problem with it",
         ),
-        ("budgets_are_kept", {"refusal": lambda p: "never"}, "the law linear, but refuses every problem with it"),
+        (
+            "budgets_are_kept",
+            {"refusal": lambda p: "never"},
+            "the law linear, but refuses every problem with it",
+        ),
     ],
 )
 def test_contract_of_a_wrong_spec_names_the_unmet_check(register, check, more, words):

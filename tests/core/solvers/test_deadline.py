@@ -34,7 +34,11 @@ def lattice(n):
     """The Laplacian of n^3 points with a unit shift, as a positive definite sparse matrix."""
     line = sp.diags_array([-np.ones(n - 1), 2.0 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
     one = sp.eye_array(n)
-    matrix = sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
+    matrix = (
+        sp.kron(sp.kron(line, one), one)
+        + sp.kron(sp.kron(one, line), one)
+        + sp.kron(sp.kron(one, one), line)
+    )
     matrix = sp.csr_array(matrix + sp.eye_array(n**3))
     matrix.sort_indices()
     return matrix
@@ -79,7 +83,10 @@ def test_newton_reads_the_clock_within_two_milliseconds_of_counted_work(form):
         system = make_system(problem, "velocity" if form == "bodies" else "impulse")
         run_newton_method(problem, system.solve, impulse, n, 1e-9, deadline, 1)
     total, longest = deadline.counted
-    assert total >= 0.3 * n * RATES["velocity contact row" if form == "velocities" else "row"] * problem.m
+    assert (
+        total
+        >= 0.3 * n * RATES["velocity contact row" if form == "velocities" else "row"] * problem.m
+    )
     assert longest <= MAX_WORK
 
 
@@ -136,7 +143,9 @@ def test_factorisation_that_the_deadline_ends_leaves_no_factor(lu, readings):
 
 
 @pytest.mark.parametrize("form", ["bodies", "rows", "velocities"])
-def test_newton_whose_deadline_passes_inside_a_factorisation_returns_a_finite_impulse(form, readings):
+def test_newton_whose_deadline_passes_inside_a_factorisation_returns_a_finite_impulse(
+    form, readings
+):
     problem = fresh(suite.case("granularF(n=6)").problem)
     if form == "velocities":
         problem = FORMS["J and M"](problem)
@@ -182,7 +191,10 @@ def test_solve_within_a_limit_that_does_not_bind_has_the_same_bits(name, clock):
             continue
         without = lv.solve(fresh(problem), name, tol=1e-8)
         within = lv.solve(fresh(problem), name, tol=1e-8, time_limit=1e3)
-        assert within.impulse.tobytes() == without.impulse.tobytes() and within.status is without.status
+        assert (
+            within.impulse.tobytes() == without.impulse.tobytes()
+            and within.status is without.status
+        )
         compared += 1
     assert compared
 
@@ -220,7 +232,11 @@ def test_solve_with_a_set_up_beyond_the_limit_makes_no_iteration(name, clock, mo
     monkeypatch.setattr(solver, "prepare", slow)
     monkeypatch.setattr(solver, "run", None)
     late = lv.solve(problem, name, time_limit=1.0)
-    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and "time limit" in late.message
+    assert (
+        late.status is lv.Status.TIME_LIMIT
+        and late.iterations == 0
+        and "time limit" in late.message
+    )
     assert np.array_equal(late.impulse, problem.start())
 
 
@@ -231,27 +247,42 @@ def test_solve_many_within_a_limit_that_does_not_bind_has_the_same_bits(form, th
     small = [fresh(p) for p in drawn if lv.explain(p).small for _ in range(10)]
     without = lv.solve_many(small, threads=threads)
     within = lv.solve_many([fresh(p) for p in small], time_limit=0.06, threads=threads)
-    assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
+    assert all(
+        a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True)
+    )
     assert [a.status for a in within] == [b.status for b in without]
 
 
 def stacked(worlds):
     of = [(p.generalized.jac, p.generalized.mass, p.generalized.v_free) for p in worlds]
-    parts = (np.array([x if x.ndim == 1 else x.toarray() for x in xs]) for xs in zip(*of, strict=True))
+    parts = (
+        np.array([x if x.ndim == 1 else x.toarray() for x in xs]) for xs in zip(*of, strict=True)
+    )
     return lv.Batch(*parts, cones=worlds[0].cones)
 
 
 @pytest.mark.parametrize("solver", ["auto", "pgs"])
 @pytest.mark.parametrize("kind", ["rows of A", "J and M", "J and M, stacked"])
 @pytest.mark.parametrize("started", [False, True])
-def test_worlds_whose_turn_comes_after_the_deadline_keep_their_judged_start(kind, solver, started, readings):
-    worlds = [dense(30, "lcp", seed) if kind == "rows of A" else over_velocities(9, 6, seed) for seed in range(12)]
+def test_worlds_whose_turn_comes_after_the_deadline_keep_their_judged_start(
+    kind, solver, started, readings
+):
+    worlds = [
+        dense(30, "lcp", seed) if kind == "rows of A" else over_velocities(9, 6, seed)
+        for seed in range(12)
+    ]
     starts = [np.full(p.m, 0.1) if started else p.start() for p in worlds]
     one = kind.endswith("stacked")
-    given = {"impulse" if one else "impulses": np.array(starts) if one else starts} if started else {}
-    found = lv.solve_many(stacked(worlds) if one else worlds, solver, time_limit=8.5, tol=1e-12, **given)
+    given = (
+        {"impulse" if one else "impulses": np.array(starts) if one else starts} if started else {}
+    )
+    found = lv.solve_many(
+        stacked(worlds) if one else worlds, solver, time_limit=8.5, tol=1e-12, **given
+    )
     last = found[11]
-    assert last.status is lv.Status.TIME_LIMIT and not last.iterations and "time limit" in last.message
+    assert (
+        last.status is lv.Status.TIME_LIMIT and not last.iterations and "time limit" in last.message
+    )
     for i in range(12):
         assert found.relative[i] == lv.residual(worlds[i], found[i].impulse).relative
     assert (
@@ -269,7 +300,9 @@ def test_deadline_that_passes_inside_a_compiled_world_of_a_batch_ends_it(rows, r
         return lv.solve_many([fresh(problem)], tol=1e-10, time_limit=limit)[0], readings.count
 
     whole, count = solve(1e9)
-    assert whole.success and count >= 3  # the first is that of the deadline, the last that after the world
+    assert (
+        whole.success and count >= 3
+    )  # the first is that of the deadline, the last that after the world
     for limit in np.arange(0.5, count - 1):
         late = solve(limit)[0]
         # A step with a factored matrix ends, and may be the last one.
@@ -301,7 +334,9 @@ SPEC = lv.SolverSpec("slow_plug_in", "slow_plug_in:Copied", laws={"lcp"}, summar
 """
 
 
-@pytest.mark.parametrize("name", [pytest.param("osqp", marks=pytest.mark.nightly), "slow_plug_in", "lemke"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("osqp", marks=pytest.mark.nightly), "slow_plug_in", "lemke"]
+)
 def test_modules_are_imported_before_the_clock_of_the_first_limit(name, tmp_path):
     """A plug-in's first solve was late; a backend's process was ended in its import, at every call."""
     if name == "osqp":
@@ -309,18 +344,24 @@ def test_modules_are_imported_before_the_clock_of_the_first_limit(name, tmp_path
     (tmp_path / "sitecustomize.py").write_text(SLOW)
     (tmp_path / "slow_plug_in.py").write_text(PLUG_IN)
     (tmp_path / "slow-1.dist-info").mkdir()
-    (tmp_path / "slow-1.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1\n")
+    (tmp_path / "slow-1.dist-info/METADATA").write_text(
+        "Metadata-Version: 2.1\nName: slow\nVersion: 1\n"
+    )
     points = "[lavender.solvers]\nslow_plug_in = slow_plug_in:SPEC\n"
     (tmp_path / "slow-1.dist-info/entry_points.txt").write_text(points)
     solve = f"lv.solve(lv.Problem.lcp([[2.0]], [1.0]), {name!r}, time_limit=0.5)"  # [s], 20 times what it takes
     paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-    done = python("-c", f"import lavender as lv; print({solve})", env={**os.environ, "PYTHONPATH": paths})
+    done = python(
+        "-c", f"import lavender as lv; print({solve})", env={**os.environ, "PYTHONPATH": paths}
+    )
     assert f"{name}: CONVERGED" in done.stdout
 
 
 def draw_jacobian_problem(seed, m=240, n=150, law="coulomb"):
     """Contacts, or bounded rows, over a full J and M."""
-    return over_velocities(m, n, seed, cones=lv.Cones.bounded(np.zeros(m), np.inf) if law == "lcp" else None)
+    return over_velocities(
+        m, n, seed, cones=lv.Cones.bounded(np.zeros(m), np.inf) if law == "lcp" else None
+    )
 
 
 @pytest.mark.parametrize("law", ["coulomb", "lcp"])
@@ -363,7 +404,9 @@ def test_starts_over_j_and_m_read_the_clock_within_two_milliseconds_and_then_kee
 def test_forming_a_reads_the_clock_within_two_milliseconds_of_counted_work():
     for density in (1.0, 0.2):
         problem = draw_jacobian_problem(0, 600, 300)
-        jac = problem.generalized.jac.toarray() * (np.random.default_rng(0).random((600, 300)) < density)
+        jac = problem.generalized.jac.toarray() * (
+            np.random.default_rng(0).random((600, 300)) < density
+        )
         problem = lv.Problem.from_jacobian(jac, np.eye(300), np.ones(300), cones=problem.cones)
         deadline = counted_deadline()
         with limit_forming(deadline):

@@ -33,12 +33,15 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
         assert phi[j] == pytest.approx(expected, rel=1e-14, abs=1e-300)
         assert psi[j] == 0.0
     step = 1e-6
-    difference = (solve.normal_shift(s + step * ds)[0] - solve.normal_shift(s - step * ds)[0]) / (2.0 * step)
+    difference = (solve.normal_shift(s + step * ds)[0] - solve.normal_shift(s - step * ds)[0]) / (
+        2.0 * step
+    )
     # The third derivative of |s_t| grows like 1/|s_t|^2, and spin has a kink: only where nothing is near 0.
     smooth = [
         i
         for i in range(len(sc.ptr) - 1)
-        if sc.part[i] == sc.part[i + 1] or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
+        if sc.part[i] == sc.part[i + 1]
+        or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
     ]
     along = np.add.reduceat(psi * ds, sc.ptr[:-1])
     np.testing.assert_allclose(difference[sc.ptr[:-1]][smooth], along[smooth], rtol=0, atol=1e-6)

@@ -24,12 +24,18 @@ def symmetric(a):
 
 def laplacian(n, diagonal=2.5):
     """n x n grid: half bandwidth n, sparse."""
-    t = sp.diags_array([-np.ones(n - 1), diagonal * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    t = sp.diags_array(
+        [-np.ones(n - 1), diagonal * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
+    )
     return sp.csr_array(sp.kron(sp.eye_array(n), t) + sp.kron(t, sp.eye_array(n)))
 
 
 def tridiagonal(m, diagonal=2.01):
-    return sp.csr_array(sp.diags_array([-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]))
+    return sp.csr_array(
+        sp.diags_array(
+            [-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]
+        )
+    )
 
 
 def shuffled(rng, a):
@@ -48,7 +54,10 @@ LINEAR = {
     "dense": (symmetric(spd(RNG, 150)), "dense"),
     "sparse": (laplacian(60), "sparse"),
     "asymmetric": (spd(RNG, 30) + np.triu(RNG.normal(size=(30, 30))), "LU"),
-    "asymmetric sparse": (sp.csr_array(laplacian(20) + sp.diags_array(np.ones(399), offsets=1)), "LU"),
+    "asymmetric sparse": (
+        sp.csr_array(laplacian(20) + sp.diags_array(np.ones(399), offsets=1)),
+        "LU",
+    ),
     "indefinite": (symmetric(RNG.normal(size=(40, 40))), "LU"),
     "indefinite dense": (symmetric(RNG.normal(size=(120, 120))), "LU"),
     "indefinite sparse": (sp.csr_array(laplacian(60) - 3.3 * sp.eye_array(3600)), "LU"),
@@ -83,7 +92,9 @@ def test_larger_semidefinite_problems_need_descent(m, shape):
     else:
         g = np.where(rng.random((m, m // 2)) < 3.0 / m, rng.random((m, m // 2)), 0.0)
     a = sp.csr_array(g @ g.T)
-    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
+    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(
+        rng.random(m) < 0.5, rng.random(m), 0.0
+    )
     problem = lv.Problem.lcp(a, b)
     solution = lv.solve(problem, "direct", tol=1e-9)
     assert solution.success, solution
@@ -133,7 +144,9 @@ def test_direct_on_an_inconsistent_linear_system_returns_a_certificate(kind, sol
     a = symmetric(g @ g.T) if kind == "symmetric" else g @ rng.normal(size=(m - 1, m))
     left = np.linalg.svd(a)[0][:, -1]
     problem = lv.Problem.linear(a, a @ rng.normal(size=m) + left)
-    assume(check_certificate(problem, left) is None)  # where not even this is a proof to rounding, nothing is
+    assume(
+        check_certificate(problem, left) is None
+    )  # where not even this is a proof to rounding, nothing is
     solution = lv.solve(problem, solver)
     assert solution.status is lv.Status.INFEASIBLE, solution
     assert check_certificate(problem, solution.certificate) is None
@@ -144,19 +157,25 @@ def test_direct_on_an_inconsistent_linear_system_returns_a_certificate(kind, sol
 def test_direct_on_an_lcp_without_solution_returns_a_certificate(solver, seed, m):
     problem = without_solution(seed, m)
     left = np.abs(np.linalg.svd(problem.dense())[0][:, -1])
-    assume(check_certificate(problem, left) is None)  # where not even this is a proof to rounding, nothing is
+    assume(
+        check_certificate(problem, left) is None
+    )  # where not even this is a proof to rounding, nothing is
     solution = lv.solve(problem, solver)
     assert solution.status is lv.Status.INFEASIBLE, solution
     assert check_certificate(problem, solution.certificate) is None
     assert solver != "lemke" or "ray" in solution.message or "row of A is zero" in solution.message
 
 
-@pytest.mark.parametrize(("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)])
+@pytest.mark.parametrize(
+    ("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)]
+)
 @pytest.mark.parametrize("bounds", [(0.0, np.inf), (-0.3, 0.3), (-np.inf, np.inf)])
 def test_direct_solves_asymmetric_bounded_rows(m, density, bounds):
     """Positive definite and not symmetric, as recorded problems are and more: compiled and LAPACK's LU, SuperLU."""
     rng = np.random.default_rng(m)
-    a = sp.random_array((m, m), density=density, rng=rng, data_sampler=rng.standard_normal).toarray()
+    a = sp.random_array(
+        (m, m), density=density, rng=rng, data_sampler=rng.standard_normal
+    ).toarray()
     mass = 10.0 ** rng.uniform(-3.0, 3.0, m)  # rows of any unit: the factor is of D^-1/2 A D^-1/2
     a = mass[:, None] * (a @ a.T / m + 0.1 * (a - a.T) + np.eye(m)) * mass
     problem = lv.Problem.lcp(a, mass * rng.normal(size=m), *(x / mass for x in bounds))
@@ -182,9 +201,13 @@ def test_direct_with_cycling_exchanges_is_stalled():
     circled = 0
     for _ in range(20):
         a = rng.normal(size=(8, 8))
-        solution = lv.solve(lv.Problem.lcp(a - a.T + 0.05 * np.eye(8), rng.normal(size=8)), "direct")
+        solution = lv.solve(
+            lv.Problem.lcp(a - a.T + 0.05 * np.eye(8), rng.normal(size=8)), "direct"
+        )
         assert solution.claim_check == "confirmed"
-        assert solution.success or (solution.status is lv.Status.STALLED and "cycle" in solution.message)
+        assert solution.success or (
+            solution.status is lv.Status.STALLED and "cycle" in solution.message
+        )
         assert solution.residual.relative <= 1.0
         circled += not solution.success
     assert circled > 0
@@ -225,7 +248,9 @@ def test_direct_shifts_a_singular_asymmetric_matrix_once(seed, m):
     a = g @ (np.eye(m // 2) + 0.7 * (skew - skew.T)) @ g.T
     x = np.maximum(rng.normal(size=m), 0.0)
     b = a @ x - np.where(x > 0.0, 0.0, rng.random(m))
-    solution = lv.solve(lv.Problem.lcp(a, b, 0.0, np.where(rng.random(m) < 0.5, 5.0, np.inf)), "direct", tol=1e-8)
+    solution = lv.solve(
+        lv.Problem.lcp(a, b, 0.0, np.where(rng.random(m) < 0.5, 5.0, np.inf)), "direct", tol=1e-8
+    )
     assert solution.status in (lv.Status.CONVERGED, lv.Status.STALLED), str(solution)
     assert solution.work["shifts"] == 1
 

@@ -26,7 +26,9 @@ def test_driver_on_contacts_has_the_bits_of_newton(friction, seed, rolling):
         assert relative == pytest.approx(truth, rel=1e-9, abs=1e-300)
         if how == REACHED:
             assert truth <= 1e-9
-        if problem.rows is None:  # one method: over bodies other columns may be left out, over rows nothing differs
+        if (
+            problem.rows is None
+        ):  # one method: over bodies other columns may be left out, over rows nothing differs
             assert (how == REACHED) == expected.success
             assert done == pytest.approx(expected.work["factorisations"], abs=2)
 

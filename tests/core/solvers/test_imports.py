@@ -65,9 +65,13 @@ def test_import_of_the_package_loads_only_needed_modules():
     seen = {name: set(of) for name, of in seen.items()}
     assert len(seen["import"]) < 160
     assert seen["import"] & {"scipy", "importlib.metadata", "pathlib"} == set()
-    files = {name.rpartition(".")[2] for name in seen["import"] if name.startswith("lavender.solvers.")}
+    files = {
+        name.rpartition(".")[2] for name in seen["import"] if name.startswith("lavender.solvers.")
+    }
     assert files & {"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} == set()
-    assert "scipy.optimize" in seen["auto"] and seen["auto"] & HEAVY == set()  # Before the clock of a limit starts.
+    assert (
+        "scipy.optimize" in seen["auto"] and seen["auto"] & HEAVY == set()
+    )  # Before the clock of a limit starts.
     assert "lavender.solvers.jacobi" in seen["jacobi"]
     assert [name for name in seen["jacobi"] if "external" in name or "lemke" in name] == []
     assert "scipy" not in seen["jacobi"] | seen["pgs"]

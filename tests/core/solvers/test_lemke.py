@@ -43,7 +43,12 @@ def test_lemke_with_another_covering_vector_avoids_the_first_ray():
 
 
 def test_lemke_exchanges_from_the_end_of_a_ray_reach_a_solution():
-    m = [[0.0, 0.0, 10.0, 20.0], [0.0, 0.0, 30.0, 15.0], [10.0, 20.0, 0.0, 0.0], [30.0, 15.0, 0.0, 0.0]]
+    m = [
+        [0.0, 0.0, 10.0, 20.0],
+        [0.0, 0.0, 30.0, 15.0],
+        [10.0, 20.0, 0.0, 0.0],
+        [30.0, 15.0, 0.0, 0.0],
+    ]
     solution = lv.solve(lv.Problem.lcp(m, np.ones(4)), "lemke", tol=1e-9)
     assert good(solution), solution
     assert solution.work["paths"] == 1
@@ -65,7 +70,10 @@ def test_lemke_stopped_by_its_budget_keeps_its_point():
     assert min(cut) < 0.5, "where the path stands, not the start"
     for cones, words in (
         (lv.Cones.contacts(0.0, 0, count=5001), "5001: use"),
-        (lv.Cones.contacts(0.5, count=1667, shape="box"), r"5001, its friction as bounded rows \d+: use"),
+        (
+            lv.Cones.contacts(0.5, count=1667, shape="box"),
+            r"5001, its friction as bounded rows \d+: use",
+        ),
     ):
         with pytest.raises(lv.CapabilityError, match=words):
             lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
@@ -91,7 +99,9 @@ def test_lemke_proves_that_free_and_bounded_rows_contradict_in_one_path(seed):
     b = rng.normal(size=m)
     half -= np.outer(y, y @ half) / (y @ y)
     b += y * (0.5 - b @ y) / (y @ y)
-    solution = lv.solve(lv.Problem.lcp(half @ half.T, b, np.r_[np.full(3, -np.inf), np.zeros(5)], np.inf), "lemke")
+    solution = lv.solve(
+        lv.Problem.lcp(half @ half.T, b, np.r_[np.full(3, -np.inf), np.zeros(5)], np.inf), "lemke"
+    )
     assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
     assert solution.work["paths"] == 1
     direction = solution.certificate / np.abs(solution.certificate).max()

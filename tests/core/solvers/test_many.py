@@ -29,17 +29,27 @@ def assert_same(many, i, single):
     own = many[i]
     found = single.residual
     assert own.impulse.tobytes() == single.impulse.tobytes()
-    for name in ("relative", "energy", "velocity", "roundoff_floor", "worst_row", "energy_at_zero", "velocity_at_zero"):
+    for name in (
+        "relative",
+        "energy",
+        "velocity",
+        "roundoff_floor",
+        "worst_row",
+        "energy_at_zero",
+        "velocity_at_zero",
+    ):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
-    assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)
-    assert (many.relative[i], many.energy[i], many.velocity_error[i], many.roundoff_floor[i], many.worst_row[i]) == (
-        found.relative,
-        found.energy,
-        found.velocity,
-        found.roundoff_floor,
-        found.worst_row,
+    assert many.impulse_error[i] == (
+        abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0
     )
+    assert (
+        many.relative[i],
+        many.energy[i],
+        many.velocity_error[i],
+        many.roundoff_floor[i],
+        many.worst_row[i],
+    ) == (found.relative, found.energy, found.velocity, found.roundoff_floor, found.worst_row)
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work) == (single.message, single.work)
@@ -47,7 +57,9 @@ def assert_same(many, i, single):
     assert own.status_conflict == single.status_conflict
 
 
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
 def test_solve_many_results_are_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
@@ -58,7 +70,9 @@ def test_solve_many_results_are_copied_and_pickled(again):
         twin, verdicts = again(many), again(found)
         for name in ("impulse", "velocity", "status", "relative", "worst_row", "iterations", "ptr"):
             np.testing.assert_array_equal(getattr(twin, name), getattr(many, name))
-        assert verdicts.verdict.tolist() == found.verdict.tolist() and str(verdicts[1]) == str(found[1])
+        assert verdicts.verdict.tolist() == found.verdict.tolist() and str(verdicts[1]) == str(
+            found[1]
+        )
         for i in range(3):
             assert_same(twin, i, many[i])
             ones = np.ones_like(many[i].impulse)
@@ -83,7 +97,9 @@ def stacked(law="coulomb", dtype=np.float64, n=20):
     cones = lv.Cones.contacts(0.0, tangents=0, count=12) if law == "lcp" else DISKS
     mu = np.random.default_rng(1).uniform(0.0, 1.0, (n, 4)) if law == "own mu" else None
     friction = "cone" if law == "cone" else "coulomb"
-    batch = lv.Batch(jac, mass, free, target=target, cones=cones, compliance=soft, mu=mu, friction=friction)
+    batch = lv.Batch(
+        jac, mass, free, target=target, cones=cones, compliance=soft, mu=mu, friction=friction
+    )
     return batch, [
         lv.Problem.from_jacobian(
             jac[i],
@@ -112,13 +128,20 @@ def laid_out(layout):
     goal = np.concatenate([target[i, :r] for i, r in enumerate(rows)])
     whole = lv.Cones(
         ptr=np.concatenate([[0], *(c.ptr[1:] + at for c, at in zip(each, ptr, strict=False))]),
-        **{k: np.concatenate([getattr(c, k) for c in each]) for k in ("kind", "lower", "upper", "mu", "patch_radius")},
+        **{
+            k: np.concatenate([getattr(c, k) for c in each])
+            for k in ("kind", "lower", "upper", "mu", "patch_radius")
+        },
     )
     make = {
         "padded": lambda: lv.Batch(jac, mass, free, target=target, cones=each, count=rows),
-        "strided": lambda: lv.Batch(wide[:, :12, :18], mass, free, target=target, cones=whole, count=rows),
+        "strided": lambda: lv.Batch(
+            wide[:, :12, :18], mass, free, target=target, cones=whole, count=rows
+        ),
         "rows": lambda: lv.Batch(flat, mass, free, target=goal, cones=whole, row_ptr=ptr),
-        "triangles": lambda: lv.Batch(flat, triangles(mass), free, target=goal, cones=whole, row_ptr=ptr),
+        "triangles": lambda: lv.Batch(
+            flat, triangles(mass), free, target=goal, cones=whole, row_ptr=ptr
+        ),
         "entries": lambda: lv.Batch(
             flat.ravel(),
             mass.ravel(),
@@ -141,7 +164,9 @@ def with_zeros(dtype):
     i, j = np.tril_indices(18)
     mass[::2, i[1::2], j[1::2]] *= i[1::2] == j[1::2]
     mass[::2, j[1::2], i[1::2]] *= i[1::2] == j[1::2]
-    return lv.Batch(jac, triangles(mass), free, cones=DISKS), [*lv.Batch(jac, mass, free, cones=DISKS)]
+    return lv.Batch(jac, triangles(mass), free, cones=DISKS), [
+        *lv.Batch(jac, mass, free, cones=DISKS)
+    ]
 
 
 def with_zeros_that_come_and_go(step):
@@ -153,13 +178,17 @@ def with_zeros_that_come_and_go(step):
         mass[k][at] = mass[k][at[::-1]] = 0.0
     mass[7, 17, 11:17] = mass[7, 11:17, 17] = 0.0
     jac, mass, free = jac[::step], mass[::step], free[::step]
-    return lv.Batch(jac, triangles(mass), free, cones=DISKS), [*lv.Batch(jac, mass, free, cones=DISKS)]
+    return lv.Batch(jac, triangles(mass), free, cones=DISKS), [
+        *lv.Batch(jac, mass, free, cones=DISKS)
+    ]
 
 
 def of_several_sizes():
     small = worlds(3, 6, 7)
     large = worlds(2, 6, 11, seed=4)
-    jac, mass, free = (np.concatenate([x.ravel(), y.ravel()]) for x, y in zip(small, large, strict=True))
+    jac, mass, free = (
+        np.concatenate([x.ravel(), y.ravel()]) for x, y in zip(small, large, strict=True)
+    )
     cones = lv.Cones.contacts(0.3, count=2)
     ptr = {"row_ptr": 6 * np.arange(6), "velocity_ptr": [0, 7, 14, 21, 32, 43]}
     return lv.Batch(jac, mass, free, cones=cones, friction="cone", **ptr), [
@@ -224,7 +253,10 @@ BATCHES = {
         for law in ("lcp", "coulomb", "cone", "own mu")
         for x in (np.float64, np.float32)
     },
-    **{name: lambda name=name: laid_out(name) for name in ("padded", "strided", "rows", "triangles", "entries")},
+    **{
+        name: lambda name=name: laid_out(name)
+        for name in ("padded", "strided", "rows", "triangles", "entries")
+    },
     **{f"zeros of M, {x.__name__}": lambda x=x: with_zeros(x) for x in (np.float64, np.float32)},
     **{f"zeros of M by {k}": lambda k=k: with_zeros_that_come_and_go(k) for k in (1, -1)},
     "several sizes": of_several_sizes,
@@ -244,7 +276,9 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
         assert given[i] == problem and given[i].precision == problem.precision
         solution = lv.solve(problem, tol=1e-8)
         assert_same(many, i, solution)
-        velocity = problem.velocity(solution.impulse).ravel() if problem.matrix is None else np.zeros(0)
+        velocity = (
+            problem.velocity(solution.impulse).ravel() if problem.matrix is None else np.zeros(0)
+        )
         assert many.velocity.ravel()[start : start + velocity.size].tobytes() == velocity.tobytes()
         start += velocity.size
     impulses = [np.float32(s.impulse) * (0.99 if i % 2 else 1.0) for i, s in enumerate(many)]
@@ -257,7 +291,14 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
         found = lv.residual_many(given, listed, precision=precision, threads=2)
         for i, (problem, impulse) in enumerate(zip(single, impulses, strict=True)):
             one = lv.residual(problem, impulse, precision=precision)
-            assert (one.relative, one.energy, one.velocity, one.worst_row, one.verdict, one.roundoff_floor) == (
+            assert (
+                one.relative,
+                one.energy,
+                one.velocity,
+                one.worst_row,
+                one.verdict,
+                one.roundoff_floor,
+            ) == (
                 found.relative[i],
                 found.energy[i],
                 found.velocity_error[i],
@@ -269,7 +310,9 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
             assert (str(own), own.verdict, own.rounding) == (str(one), one.verdict, one.rounding)
             for field in dataclasses.fields(one):
                 if field.name != "_problem":
-                    np.testing.assert_array_equal(getattr(own, field.name), getattr(one, field.name), field.name)
+                    np.testing.assert_array_equal(
+                        getattr(own, field.name), getattr(one, field.name), field.name
+                    )
 
 
 def test_first_numbers_of_a_world_are_read_from_the_arrays(monkeypatch):
@@ -281,8 +324,14 @@ def test_first_numbers_of_a_world_are_read_from_the_arrays(monkeypatch):
         patch.delattr(lv.Batch, "get_world")
         for i in range(3):
             assert many[i].success and many[i].residual.relative == many.relative[i]
-            assert many[i].impulse.tolist() == many.impulse[i].tolist() and many[i].start == "the given impulses"
-            assert (found[i].relative, found[i].worst_row) == (found.relative[i], found.worst_row[i])
+            assert (
+                many[i].impulse.tolist() == many.impulse[i].tolist()
+                and many[i].start == "the given impulses"
+            )
+            assert (found[i].relative, found[i].worst_row) == (
+                found.relative[i],
+                found.worst_row[i],
+            )
     assert found[1].worst_name == batch[1].row_name(found.worst_row[1])
 
 
@@ -339,7 +388,11 @@ def test_invalid_world_of_a_batch_is_named_and_others_are_solved(threads):
     for i in range(10):
         if i in words:
             assert words[i] in str(many.faults[i]) and f"world {i}:" in str(many.faults[i])
-            assert many.status[i] is lv.Status.INVALID_PROBLEM and np.isnan(many.relative[i]) and not many.success[i]
+            assert (
+                many.status[i] is lv.Status.INVALID_PROBLEM
+                and np.isnan(many.relative[i])
+                and not many.success[i]
+            )
             assert found.verdict[i] == "" and np.isnan(found.relative[i]) and i in found.faults
             with pytest.raises(lv.InputError, match=f"world {i}:"):
                 many[i]
@@ -360,7 +413,9 @@ def test_solve_many_index_selects_worlds_as_entries_of_an_array():
     found = lv.residual_many(batch, many.impulse)
     mask = np.array([True, False, False, True, False])
     for which in (mask, mask.tolist(), [0, 3], np.array([0, -2]), slice(0, 5, 3)):
-        assert [one.impulse.tobytes() for one in many[which]] == [many.impulse[i].tobytes() for i in (0, 3)]
+        assert [one.impulse.tobytes() for one in many[which]] == [
+            many.impulse[i].tobytes() for i in (0, 3)
+        ]
         assert [one.relative for one in found[which]] == found.relative[[0, 3]].tolist()
         assert batch[which] == [batch[0], batch[3]]
     assert many[np.int64(3)] is many[3] and many[[]] == []
@@ -392,7 +447,10 @@ def test_solve_many_with_a_start_that_is_not_finite_fails_in_its_world_only(list
     many = lv.solve_many(given, tol=1e-8, errors="status", **starts)
     impulse, velocity = many.impulse.reshape(6, -1), many.velocity.reshape(6, -1)
     assert sorted(many.faults) == [2, 4] and not many.success[[2, 4]].any()
-    assert many.iterations[[2, 4]].tolist() == [0, 0] and many.worst_row[[2, 4]].tolist() == [-1, -1]
+    assert many.iterations[[2, 4]].tolist() == [0, 0] and many.worst_row[[2, 4]].tolist() == [
+        -1,
+        -1,
+    ]
     assert np.isnan(impulse[[2, 4]]).all() and np.isnan(velocity[[2, 4]]).all()
     for i in (0, 1, 3, 5):
         # Each start is a solution; its friction exceeded its bound by at most 4e-12 of it, and is projected on it.

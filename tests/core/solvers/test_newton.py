@@ -51,7 +51,9 @@ def test_newton_interior_point_with_more_rows_than_velocities_takes_no_more_step
 @pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
-    problem = random_contact_problem(seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10)
+    problem = random_contact_problem(
+        seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10
+    )
     system = system_in(problem, "velocity" if form == "augmented" else form)
     solve = system.solve
     arrays = system.solve.view_arrays()
@@ -73,7 +75,9 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     if max(change for _, change in sides) < 1e-4:
         difference = (sides[0][0] - sides[1][0]) / (2.0 * step)
         # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
-        np.testing.assert_allclose(difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max()))
+        np.testing.assert_allclose(
+            difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max())
+        )
     solve.evaluate_natural_map(z, solve.multiply_matrix(z) - g, law, eps)
     assert solve.factor("natural", eps, augmented=form == "augmented")
     r = rng.normal(size=m)
@@ -168,7 +172,9 @@ def test_factor_of_a_graph_of_bodies_solves_as_a_dense_matrix(s, n, m):
             for _ in range(2):  # what a factor leaves behind does not reach the next
                 assert solve.factor(what)
                 out = solve.solve(what, r)
-                np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+                np.testing.assert_allclose(
+                    out, expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+                )
                 outs.add(out.tobytes())
         assert len(outs) == 1
 
@@ -202,8 +208,12 @@ def test_newton_solves_sparse_free_rows_together_with_all_rows(even, seed):
     system.solve.view_arrays().p[:] = free
     assert system.solve.factor("natural", eps)
     assert not system.solve.uses_fallback
-    expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
-    np.testing.assert_allclose(system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    expected = np.linalg.solve(
+        np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r
+    )
+    np.testing.assert_allclose(
+        system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -233,7 +243,9 @@ def pinched(seed, form, **kind):
     sides["normal"][1::2] *= -1.0
     b[first[1::2]] = np.random.default_rng(seed).uniform(0.1, 1.0, 4) - b[first[::2]]
     cones = replace(p.cones, mu=0.2 + p.cones.mu)
-    return FORMS[form](replace(p, rows=replace(rows, **sides), b=b, cones=cones, compliance=np.zeros(p.m)))
+    return FORMS[form](
+        replace(p, rows=replace(rows, **sides), b=b, cones=cones, compliance=np.zeros(p.m))
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -298,7 +310,9 @@ def draw_generalized_contacts(seed, nv, contacts, trees=1):
     jac = np.zeros((3 * contacts, trees * nv))
     for k in range(contacts):
         first = k % trees * nv
-        jac[3 * k : 3 * k + 3, first : first + 2 * nv] = rng.normal(size=jac[:3, first : first + 2 * nv].shape)
+        jac[3 * k : 3 * k + 3, first : first + 2 * nv] = rng.normal(
+            size=jac[:3, first : first + 2 * nv].shape
+        )
     cones = lv.Cones.contacts(rng.uniform(0.1, 1.0, (contacts, 2)))
     v_free = rng.normal(size=trees * nv)
     return lv.Problem.from_jacobian(sp.csr_array(jac), blocks, v_free, cones=cones, compliance=1e-3)
@@ -313,7 +327,9 @@ def test_newton_coulomb_jacobian_with_few_rows_equals_matrix(seed):
     assert "Coulomb rounds" not in solution.work
     # Both run the same steps on the same matrix, up to rounding.
     assert solution.work["factorisations"] == expected.work["factorisations"]
-    assert solution.impulse == pytest.approx(expected.impulse, rel=1e-8, abs=1e-8 * abs(expected.impulse).max())
+    assert solution.impulse == pytest.approx(
+        expected.impulse, rel=1e-8, abs=1e-8 * abs(expected.impulse).max()
+    )
 
 
 def test_newton_coulomb_jacobian_with_many_rows_steps_over_velocities():
@@ -336,7 +352,9 @@ def test_newton_jacobian_with_two_bounds_takes_few_steps(seed):
     cones = lv.Cones.bounded(-bound, bound)
     problem = lv.Problem.from_jacobian(jac, np.eye(60), rng.normal(size=60), cones=cones)
     solution = lv.solve(problem, "newton", tol=1e-9)
-    assert solution.success and solution.work["factorisations"] <= 6  # Exchanges over rows took 1 to 3.
+    assert (
+        solution.success and solution.work["factorisations"] <= 6
+    )  # Exchanges over rows took 1 to 3.
 
 
 @pytest.mark.parametrize("form", ["rows", "matrix"])
@@ -370,8 +388,14 @@ def test_newton_of_cones_takes_as_many_steps_for_upper_limits_as_for_lower_ones(
         steps = []
         for sign in (1.0, -1.0):
             low, high = (-np.inf, 0.01 * (1 + seed)) if sign > 0.0 else (-0.01 * (1 + seed), np.inf)
-            limits = {"lower": np.where(is_joint, low, cones.lower), "upper": np.where(is_joint, high, cones.upper)}
-            turned = {"rows": replace(bodies.rows, jac=sign * bodies.rows.jac), "cones": replace(cones, **limits)}
+            limits = {
+                "lower": np.where(is_joint, low, cones.lower),
+                "upper": np.where(is_joint, high, cones.upper),
+            }
+            turned = {
+                "rows": replace(bodies.rows, jac=sign * bodies.rows.jac),
+                "cones": replace(cones, **limits),
+            }
             problem = replace(bodies, b=np.where(is_joint, sign, 1.0) * bodies.b, **turned)
             steps.append(lv.solve(FORMS[form](problem), "newton", tol=1e-9).iterations)
         assert abs(steps[0] - steps[1]) <= 3, f"{seed}: {steps}"
@@ -403,7 +427,9 @@ def test_newton_over_velocities_with_coulomb_friction_takes_few_steps():
     for seed in range(20):
         problem = random_generalized_problem(seed, "coulomb", n=6, contacts=12, compliance=False)
         mu = np.where(problem.cones.is_contact, 1.5, 0.0)
-        solution = lv.solve(replace(problem, cones=replace(problem.cones, mu=mu)), "newton", tol=1e-9)
+        solution = lv.solve(
+            replace(problem, cones=replace(problem.cones, mu=mu)), "newton", tol=1e-9
+        )
         assert solution.success, str(solution)
         steps.append(solution.iterations)
     assert sum(steps) <= 900 and max(steps) <= 110, steps
@@ -425,7 +451,12 @@ def test_newton_needs_no_more_factorisations_for_unequal_compliances_of_a_contac
         soft = 10.0 ** rng.uniform(softest - 2.0, softest, 3 * contacts)
         for k, own in enumerate((soft, np.full(3 * contacts, soft.min()))):
             problem = lv.Problem.from_jacobian(
-                jac, half @ half.T + np.eye(n), free, cones=lv.Cones.contacts(mu, 2), compliance=own, friction=law
+                jac,
+                half @ half.T + np.eye(n),
+                free,
+                cones=lv.Cones.contacts(mu, 2),
+                compliance=own,
+                friction=law,
             )
             found = lv.solve(problem, "newton", tol=1e-9, form="velocity")
             assert found.success, (seed, found)

@@ -42,7 +42,9 @@ def test_nncg_first_iterations_equal_a_dense_twin(restart, kept):
         q = np.zeros_like(g) if p is None else beta * p
         p = q - g
         got = lv.solve(problem, "nncg", tol=0.0, max_iter=k + 1, restart=restart).impulse
-        np.testing.assert_allclose(got, y, rtol=1e-9, atol=1e-12 * np.abs(y).max())  # sums in another order
+        np.testing.assert_allclose(
+            got, y, rtol=1e-9, atol=1e-12 * np.abs(y).max()
+        )  # sums in another order
         x = y + q
     assert count >= kept
 
@@ -60,7 +62,9 @@ def test_nncg_starts_from_the_answer_of_the_cone_law(name):
     convex = lv.solve(problem, name, convex=500, tol=1e-10, max_iter=50_000)
     assert convex.success
     assert convex.iterations < 500
-    np.testing.assert_allclose(convex.impulse, inside, atol=1e-7)  # eigenvalues of A from 0.05 to about 30
+    np.testing.assert_allclose(
+        convex.impulse, inside, atol=1e-7
+    )  # eigenvalues of A from 0.05 to about 30
     # And where contacts slide, the Coulomb iterations that follow correct it.
     slippery = lv.solve(base, name, convex=10, tol=1e-8, max_iter=50_000)
     assert slippery.success
@@ -115,4 +119,7 @@ def test_anderson_slipping_pyramid_leaves_the_cone_law():
     problem = lv.suite.case("pyramidF(k=10)").problem
     found = lv.solve(problem, "anderson", tol=1e-6, max_iter=2000)
     assert found.success
-    assert found.iterations < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
+    assert (
+        found.iterations
+        < 1.3 * lv.solve(problem, "anderson", convex=0, tol=1e-6, max_iter=2000).iterations
+    )

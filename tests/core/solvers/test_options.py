@@ -5,7 +5,12 @@ import itertools
 
 import numpy as np
 import pytest
-from random_problems import add_compliance, as_matrix, make_well_posed_problems, random_contact_problem
+from random_problems import (
+    add_compliance,
+    as_matrix,
+    make_well_posed_problems,
+    random_contact_problem,
+)
 
 import lavender as lv
 from lavender import registry
@@ -45,7 +50,9 @@ def get_values(name, option):
 
 @pytest.mark.parametrize(("name", "option"), LISTED)
 def test_every_two_values_of_an_option_give_other_iterates(name, option):
-    soft = add_compliance(random_contact_problem(5, tangents=2, spin=False, joints=6, contacts=30, bodies=12), 0.01)
+    soft = add_compliance(
+        random_contact_problem(5, tangents=2, spin=False, joints=6, contacts=30, bodies=12), 0.01
+    )
     problems = [soft, as_matrix(soft), *make_well_posed_problems(SPECS[name])]
     problems = [p for p in problems if SPECS[name].refuses(p) is None]
     values = get_values(name, option)
@@ -65,7 +72,9 @@ def test_every_two_values_of_an_option_give_other_iterates(name, option):
 @pytest.mark.parametrize("name", lv.available())
 def test_iterations_of_every_solver_are_within_max_iter(name):
     spec = registry.get(name)
-    program = lv.Problem.from_qp(np.diag([1.0, 2.0, 3.0]), -np.arange(3.0), G=np.eye(2, 3) + 1.0, h=[0.1, 0.2])
+    program = lv.Problem.from_qp(
+        np.diag([1.0, 2.0, 3.0]), -np.arange(3.0), G=np.eye(2, 3) + 1.0, h=[0.1, 0.2]
+    )
     problems = [*make_well_posed_problems(spec), *[program] * (spec.refuses(program) is None)]
     for problem, budget in itertools.product(problems, (1, 2, 7)):
         solution = lv.solve(problem, name, tol=1e-9, max_iter=budget)

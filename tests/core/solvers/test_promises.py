@@ -7,7 +7,12 @@ import functools
 
 import numpy as np
 import pytest
-from random_problems import make_problems_of_every_kind, nearly_singular, random_lcp, without_solution
+from random_problems import (
+    make_problems_of_every_kind,
+    nearly_singular,
+    random_lcp,
+    without_solution,
+)
 
 import lavender as lv
 from lavender import registry
@@ -57,15 +62,22 @@ def test_solve_from_a_stale_start_is_not_behind_it_by_the_rule(name):
 
 @pytest.mark.parametrize("name", OWN)
 def test_solve_within_a_budget_makes_true_claims(name):
-    for problem in accepted(name, *(without_solution(seed, 6) for seed in range(9)), *map(nearly_singular, range(20))):
+    for problem in accepted(
+        name, *(without_solution(seed, 6) for seed in range(9)), *map(nearly_singular, range(20))
+    ):
         for budget in (0, 1, 7):
             solution = lv.solve(problem, name, max_iter=budget, tol=TOL)
             judged = lv.residual(problem, solution.impulse)
-            assert solution.claim_check == "confirmed" and solution.iterations <= budget, str(solution)
+            assert solution.claim_check == "confirmed" and solution.iterations <= budget, str(
+                solution
+            )
             assert solution.residual.relative == judged.relative
             assert solution.success == (judged.relative <= TOL) or judged.roundoff_floor > TOL
             if solution.status is lv.Status.INFEASIBLE:
-                assert solution.certificate is not None and judged.energy <= judged.energy_at_zero * (1.0 + 1e-14)
+                assert (
+                    solution.certificate is not None
+                    and judged.energy <= judged.energy_at_zero * (1.0 + 1e-14)
+                )
                 assert (solution.impulse >= problem.cones.lower).all() and (
                     solution.impulse <= problem.cones.upper
                 ).all()
@@ -77,7 +89,11 @@ def test_solve_to_a_velocity_error_meets_it_on_every_row(name, velocity_tol):
     for problem in accepted(name):
         solution = lv.solve(problem, name, velocity_tol=velocity_tol, max_iter=20_000)
         worst = lv.residual(problem, solution.impulse).velocity
-        assert solution.success == (worst <= velocity_tol) and solution.success, (problem, str(solution), worst)
+        assert solution.success == (worst <= velocity_tol) and solution.success, (
+            problem,
+            str(solution),
+            worst,
+        )
         again = lv.solve(problem, name, impulse=solution.impulse, velocity_tol=velocity_tol)
         assert again.success and (again.iterations <= 1 or not registry.get(name).resumable)
         many = lv.solve_many([problem] * 2, name, velocity_tol=velocity_tol, max_iter=20_000)
@@ -88,7 +104,10 @@ def test_velocity_tol_of_masses_times_1000_and_speeds_times_10_takes_the_same_sw
     A = np.array([[2.0, 1.0], [1.0, 2.0]])
     b = np.array([1.0, 0.5])
     own = lv.solve(lv.Problem.lcp(A, b), "pgs", velocity_tol=1e-4)
-    assert own.iterations == lv.solve(lv.Problem.lcp(A / 1000.0, 10.0 * b), "pgs", velocity_tol=1e-3).iterations
+    assert (
+        own.iterations
+        == lv.solve(lv.Problem.lcp(A / 1000.0, 10.0 * b), "pgs", velocity_tol=1e-3).iterations
+    )
 
 
 BALLS = 10  # Each is an island of its own: a contact with friction that slides.
@@ -114,7 +133,9 @@ def balls_beside_jams(kind, friction, jams=1):
         every = every + cones
     v_free = np.r_[np.tile([-0.1635, 0.3, 0.0], BALLS), np.zeros(jams)]
     target = [0.0] * m + target * jams
-    return lv.Problem.from_jacobian(jac, np.eye(n + jams), v_free, target=target, cones=every, friction=friction)
+    return lv.Problem.from_jacobian(
+        jac, np.eye(n + jams), v_free, target=target, cones=every, friction=friction
+    )
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -125,7 +146,9 @@ def test_islands_next_to_an_infeasible_one_meet_the_tolerance(name, friction):
         if registry.get(name).refuses(problem) is not None:
             continue
         relative = lv.solve(problem, name, tol=TOL).residual.islands.relative
-        assert relative.max() <= 1.0 + 1e-3, kind  # of the start, with what rounding of the large impulses hides
+        assert relative.max() <= 1.0 + 1e-3, (
+            kind
+        )  # of the start, with what rounding of the large impulses hides
         # ADMM has one penalty for all islands: one without a solution keeps the others from Coulomb's law.
         assert (relative[:BALLS] <= TOL).all() or (name, friction) == ("admm", "coulomb"), kind
 
@@ -139,7 +162,11 @@ def test_opposed_limits_that_contradict_each_other_leave_no_impulse_worse_than_z
         jac = np.vstack([rng.normal(size=(2, n)), limit, -limit])
         ends = np.full(4, np.inf)
         general = lv.Problem.from_jacobian(
-            jac, np.eye(n), rng.normal(size=n), target=[0.0, 0.0, 5.0, 5.0], cones=lv.Cones.bounded(np.zeros(4), ends)
+            jac,
+            np.eye(n),
+            rng.normal(size=n),
+            target=[0.0, 0.0, 5.0, 5.0],
+            cones=lv.Cones.bounded(np.zeros(4), ends),
         )
         for problem in (general, lv.Problem.lcp(jac @ jac.T, general.b)):
             if registry.get(name).refuses(problem) is None:

@@ -68,7 +68,9 @@ def test_register_of_a_name_twice_raises_without_replace(register):
     assert lv.get("mine").summary == "another"
 
 
-def test_impulse_of_an_infeasible_problem_is_inside_its_bounds_whatever_the_solver_returned(plug_in):
+def test_impulse_of_an_infeasible_problem_is_inside_its_bounds_whatever_the_solver_returned(
+    plug_in,
+):
     def pull(problem, impulse):
         impulse[:] = -5.0
         return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.ones(2))

@@ -21,7 +21,9 @@ def make_wide_problem(seed):
         cones = lv.Cones.bounded(np.where(rng.random(m) < 0.5, 0.0, -high), high)
     else:
         cones = lv.Cones.contacts(rng.uniform(0.0, 2.0, m // 3))
-    return lv.Problem.from_jacobian(jac, np.diag(masses), rng.standard_normal(nv), target=target, cones=cones)
+    return lv.Problem.from_jacobian(
+        jac, np.diag(masses), rng.standard_normal(nv), target=target, cones=cones
+    )
 
 
 @pytest.mark.parametrize("solver", ["auto", "newton"])

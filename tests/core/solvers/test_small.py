@@ -7,7 +7,13 @@ import pytest
 from calls import SHORT, check, facts
 from hypothesis import given
 from hypothesis import strategies as st
-from random_problems import as_matrix, random_contact_problem, random_generalized_problem, random_lcp, seeds
+from random_problems import (
+    as_matrix,
+    random_contact_problem,
+    random_generalized_problem,
+    random_lcp,
+    seeds,
+)
 
 import lavender as lv
 from benchmarks.core_problems import forms, stacks
@@ -25,14 +31,22 @@ def draw(kind, seed):
     if kind == "singular":
         g = rng.normal(size=(9, 9 - seed % 4)) * 10.0 ** rng.uniform(0.0, seed % 3, (9, 1))
         a = g @ g.T
-        return lv.Problem.linear(0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9))
+        return lv.Problem.linear(
+            0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9)
+        )
     if kind == "one-sided":  # unsymmetric
         return lv.Problem.lcp(
-            rng.normal(size=(6, 6)) + 6.0 * np.eye(6), rng.normal(size=6), friction=["coulomb", "cone"][seed % 2]
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
+            rng.normal(size=6),
+            friction=["coulomb", "cone"][seed % 2],
         )
     if kind.startswith("rows"):
         return random_contact_problem(
-            seed, kind.split()[1], bodies=3, joints=int(rng.integers(0, 3)), contacts=int(rng.integers(0, 5))
+            seed,
+            kind.split()[1],
+            bodies=3,
+            joints=int(rng.integers(0, 3)),
+            contacts=int(rng.integers(0, 5)),
         )
     if kind.startswith("matrix"):
         return as_matrix(draw("rows " + kind.split()[1], seed))
@@ -41,7 +55,12 @@ def draw(kind, seed):
         return hollow(random_generalized_problem(seed, law, n=8, compliance=seed % 3 > 0), rng)
     tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
     return random_generalized_problem(
-        seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents
+        seed,
+        law,
+        n=int(rng.integers(2, 12)),
+        compliance=seed % 3 > 0,
+        contacts=4,
+        tangents=tangents,
     )
 
 
@@ -153,7 +172,9 @@ def test_islands_under_friction_are_one_call(friction, form, equal, tol, corners
 def test_islands_of_bodies_with_joints_are_one_call(law, seed):
     """Pairs of bodies, each with a joint or none, in no order; with a wrong number in a cut no call would end."""
     rng = np.random.default_rng(seed)
-    drawn = random_contact_problem(seed, law, bodies=20, joints=8, contacts=70, tangents=2, spin=False)
+    drawn = random_contact_problem(
+        seed, law, bodies=20, joints=8, contacts=70, tangents=2, spin=False
+    )
 
     def pairs(n):
         second = 2 * rng.integers(0, 10, n) + 1
@@ -190,7 +211,9 @@ def test_islands_that_share_an_immovable_body_are_one_call(law):
     found = check(on_body, "auto")
     expected = check(replace(columns, b=b), "auto")
     assert found.success and found.message == expected.message and "on 4 islands" in found.message
-    np.testing.assert_allclose(found.impulse, expected.impulse, atol=1e-6)  # The bodies have another order.
+    np.testing.assert_allclose(
+        found.impulse, expected.impulse, atol=1e-6
+    )  # The bodies have another order.
 
 
 def test_compiled_call_on_an_island_at_rest_returns_zero():

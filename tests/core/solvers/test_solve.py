@@ -34,7 +34,9 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
 
     def interrupt():
         begun.append(solver)
-        if first.acquire(blocking=False):  # of two threads that begin at the same time, one sends the signal
+        if first.acquire(
+            blocking=False
+        ):  # of two threads that begin at the same time, one sends the signal
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         time.sleep(1e-3)
 
@@ -51,7 +53,9 @@ def test_ctrl_c_during_solve_many_starts_no_more_problems(solver, monkeypatch):
             if solver == "pgs":
                 return self.hand.process_worlds(*args)
             interrupt()
-            end = time.monotonic() + 60.0  # A signal that was lost fails the test instead of stopping all tests.
+            end = (
+                time.monotonic() + 60.0
+            )  # A signal that was lost fails the test instead of stopping all tests.
             while not self.stop[0] and time.monotonic() < end:
                 time.sleep(1e-3)
             return self.hand.process_worlds(*args)
@@ -76,7 +80,9 @@ def test_prepared_solve_of_another_velocity_keeps_the_targets():
         single = lv.solve(make(velocity))
         np.testing.assert_allclose(own.impulse, single.impulse, rtol=1e-5, atol=1e-5)
         # Rounding of b does not accumulate from call to call.
-        np.testing.assert_allclose(prepared.problem.b, target - jac @ velocity, rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(
+            prepared.problem.b, target - jac @ velocity, rtol=0.0, atol=1e-13
+        )
         assert prepared.problem.generalized.v_free.tolist() == velocity.tolist()
 
 
@@ -92,7 +98,9 @@ def test_problems_that_differ_in_b_share_memory_of_the_operator_and_free_each_ot
     assert [ref() is not None for ref in seen] == [False] * 4 + [True]
 
 
-@pytest.mark.parametrize("arguments", [{}, {"max_iter": 50}, {"time_limit": 5.0}, {"velocity_tol": 1e-6}])
+@pytest.mark.parametrize(
+    "arguments", [{}, {"max_iter": 50}, {"time_limit": 5.0}, {"velocity_tol": 1e-6}]
+)
 @pytest.mark.parametrize("name", ["auto", "pgs", "newton"])
 def test_text_of_a_solution_names_its_start(name, arguments):
     problem = stack(6)
@@ -102,7 +110,10 @@ def test_text_of_a_solution_names_its_start(name, arguments):
         assert ", from " not in str(solve(problem, name, **arguments))
         assert "from problem.guess," in str(solve(stored, name, **arguments))
         assert "from the given impulses," in str(solve(stored, name, impulse=given, **arguments))
-    starts = [solution.start for solution in lv.solve_many([problem, stored], name, impulses=[given, None], tol=1e-6)]
+    starts = [
+        solution.start
+        for solution in lv.solve_many([problem, stored], name, impulses=[given, None], tol=1e-6)
+    ]
     assert starts == ["the given impulses", "problem.guess"]
 
 
@@ -122,5 +133,11 @@ def test_solve_of_new_problem_computes_each_check_and_array_once(name):
         lv.solve(lv.Problem.lcp(TINY.matrix, TINY.b), name)
     finally:
         sys.setprofile(before)
-    once = ("check_accepted", "check_arguments", "get_zero_impulse_reference", "_compressed", "finish")
+    once = (
+        "check_accepted",
+        "check_arguments",
+        "get_zero_impulse_reference",
+        "_compressed",
+        "finish",
+    )
     assert {function: calls.count(function) for function in once} == dict.fromkeys(once, 1)

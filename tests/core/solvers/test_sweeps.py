@@ -22,7 +22,9 @@ def test_sweep_in_every_form_equals_the_dense_update(kind, seed):
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
     size = np.abs(lam).max()
     if lv.get("sequential_impulses").refuses(problem) is None:
-        np.testing.assert_allclose(sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0)
+        np.testing.assert_allclose(
+            sweeps(problem, "sequential_impulses", 5), lam, atol=1e-12 * size, rtol=0
+        )
     for form, given_by in FORMS.items():
         atol = 1e-9 * size if form == "J and M" else 1e-12 * size
         np.testing.assert_allclose(sweeps(given_by(problem), "pgs", 5), lam, atol=atol, rtol=0)
@@ -56,7 +58,9 @@ def test_row_order_given_by_name_or_by_numbers_is_the_same(name, seed):
     )
     x = sweeps(problem, name, 7, **({"order": permutation} if name == "pgs" else {}))
     # Sweeping P A P^T forwards is sweeping A in the order P, up to the order of additions.
-    np.testing.assert_allclose(sweeps(permuted, name, 7), x[permutation], atol=1e-12 * np.abs(x).max())
+    np.testing.assert_allclose(
+        sweeps(permuted, name, 7), x[permutation], atol=1e-12 * np.abs(x).max()
+    )
 
 
 @given(seed=seeds)
@@ -74,7 +78,9 @@ def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
             seen = lam.copy() if name == "jacobi" else lam
             for i in range(len(b)):
                 lam[i] -= omega * (a[i] @ seen - b[i]) / a[i, i]
-        np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
+        np.testing.assert_allclose(
+            sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max()
+        )
 
 
 @pytest.mark.parametrize("k", [2, 3, 5])
@@ -97,14 +103,20 @@ def test_jacobi_safe_damping_is_below_the_limit_of_convergence(seed):
     # omega < 2 / L, L the largest eigenvalue of D^-1 A, for symmetric positive semidefinite A.
     problem = random_lcp(seed, m=12)
     scaled = problem.dense() / np.sqrt(np.outer(problem.d, problem.d))
-    assert 0.0 < serial.jacobi_damping_of_matrix(problem.csr_data) * np.linalg.eigvalsh(scaled).max() < 2.0
+    assert (
+        0.0
+        < serial.jacobi_damping_of_matrix(problem.csr_data) * np.linalg.eigvalsh(scaled).max()
+        < 2.0
+    )
 
 
 @given(seed=seeds)
 def test_jacobi_damping_is_the_same_in_every_unit(seed):
     problem = random_lcp(seed, m=12)
     rng = np.random.default_rng(seed)
-    size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
+    size = 2.0 ** rng.integers(
+        -8, 9, 12
+    )  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
     assert serial.jacobi_damping_of_matrix(other.csr_data) == pytest.approx(
         serial.jacobi_damping_of_matrix(problem.csr_data), rel=1e-12

@@ -41,11 +41,16 @@ def test_written_out_sweeps_keep_joints_spin_and_warm_starts(seed, monkeypatch):
     for order, impulse in plain.items():
         # v = M^-1 J^T lam of the warm start is summed in another order: rounding, carried through 20 sweeps.
         np.testing.assert_allclose(
-            sweeps(problem, NAME, 20, order=order, impulse=start), impulse, rtol=0, atol=1e-11 * np.abs(impulse).max()
+            sweeps(problem, NAME, 20, order=order, impulse=start),
+            impulse,
+            rtol=0,
+            atol=1e-11 * np.abs(impulse).max(),
         )
 
 
-def test_written_out_sweeps_that_stall_return_the_best_iterate_in_the_given_order(pile, monkeypatch):
+def test_written_out_sweeps_that_stall_return_the_best_iterate_in_the_given_order(
+    pile, monkeypatch
+):
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     solver = lv.prepare(pile, "sequential_impulses", order="local")
     solver.solve(tol=1e-30, max_iter=40)
@@ -54,7 +59,9 @@ def test_written_out_sweeps_that_stall_return_the_best_iterate_in_the_given_orde
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_written_out_sweeps_that_are_unfinished_return_impulses_in_the_given_order(order, pile, monkeypatch):
+def test_written_out_sweeps_that_are_unfinished_return_impulses_in_the_given_order(
+    order, pile, monkeypatch
+):
     plain = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
     monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     copied = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
@@ -77,7 +84,9 @@ def test_sweeps_with_any_order_within_a_color_have_the_same_bits(name, large, pi
             is_contact = np.arange(problem.n_blocks) >= compute_block_order(problem).split
             orders = [np.lexsort((rng.random(len(color)), color, is_contact)) for _ in range(3)]
             for budget in ({"tol": 0.0, "max_iter": 3}, {"tol": 1e-6, "max_iter": 60}):
-                results = [lv.solve(problem, name, order=order, **budget) for order in ("colored", *orders)]
+                results = [
+                    lv.solve(problem, name, order=order, **budget) for order in ("colored", *orders)
+                ]
                 assert len({s.impulse.tobytes() for s in results}) == 1
                 assert len({(s.iterations, s.status) for s in results}) == 1
 
@@ -100,7 +109,9 @@ def test_written_out_sweeps_with_new_numbers_keep_the_structure(order, pile, mon
     found = []
     for module, name in ((sweeping, "compute_block_order"), (layout, "number_bodies_by_adjacency")):
         true = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
+        monkeypatch.setattr(
+            module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw)
+        )
     changed = prepared.solve(other, tol=0.0, max_iter=3)
     assert changed.impulse.tobytes() == fresh.tobytes()
     # An order that changes with every sweep begins anew; of the others nothing is looked for again.

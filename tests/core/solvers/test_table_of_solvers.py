@@ -99,5 +99,8 @@ assert "| `toy` | linear, lcp | matrix |" in text and "| `toy` | `damping` |" in
 def test_a_file_and_a_line_of_the_table_are_sufficient_for_every_use(tmp_path):
     (tmp_path / "solvers").mkdir()
     (tmp_path / "solvers" / "toy.py").write_text(textwrap.dedent(TOY), encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
     python("-c", PRELUDE + USES, tmp_path / "solvers", tmp_path / "out", env=environment, cwd=ROOT)

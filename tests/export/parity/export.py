@@ -80,7 +80,9 @@ def of_velocities():
         cones = lv.Cones.contacts(0.5, count=count, shape="box" if seed > 3 else "disk")
         jac = rng.normal(size=(3 * count, 12))
         friction = ("coulomb", "cone")[seed % 2]
-        yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=12), cones=cones, friction=friction)
+        yield lv.Problem.from_jacobian(
+            jac, mass, rng.normal(size=12), cones=cones, friction=friction
+        )
 
 
 def solved(given, number):
@@ -100,7 +102,9 @@ def problems():
     for seed in range(40):
         yield random_lcp(seed, m=8 + seed, rank=6 if seed % 5 == 4 else None)
         tangents = (0, 1, 2, None)[seed % 4]
-        factored = random_contact_problem(seed, tangents=tangents, spin=seed % 3 == 0, bodies=4 + seed % 9)
+        factored = random_contact_problem(
+            seed, tangents=tangents, spin=seed % 3 == 0, bodies=4 + seed % 9
+        )
         yield factored
         yield as_matrix(factored)
     rng = np.random.default_rng(40)

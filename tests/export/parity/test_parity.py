@@ -15,8 +15,14 @@ pytestmark = pytest.mark.slow
 def missing_requirement():
     if shutil.which("gcc") is None:
         return "gcc is not installed"
-    pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm): no compiler for AArch64")
-    return "" if shutil.which("qemu-aarch64-static") else "no qemu-aarch64-static (Debian: qemu-user-static)"
+    pytest.importorskip(
+        "ziglang", reason="ziglang is not installed (extra: wasm): no compiler for AArch64"
+    )
+    return (
+        ""
+        if shutil.which("qemu-aarch64-static")
+        else "no qemu-aarch64-static (Debian: qemu-user-static)"
+    )
 
 
 def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen():

@@ -10,7 +10,10 @@ import lavender as lv
 from lavender.sim.scene import SCENES
 
 STANDING = {"stack", "card_house", "heavy_on_light", "table", "ramp", "pyramid"}
-SMALLER = {"pyramid": {"base": 5}, "pile": {"n": 30, "kind": "mixed"}}  # the same with less to compute
+SMALLER = {
+    "pyramid": {"base": 5},
+    "pile": {"n": 30, "kind": "mixed"},
+}  # the same with less to compute
 SETTLED = 2.0  # s, from which drift and penetration are measured
 
 
@@ -75,7 +78,9 @@ def test_gallery_scene_solved_by_newton_keeps_energy(name):
 
 
 def test_newton_locks_a_redundant_loop_unless_no_projection_moves_its_rows_apart():
-    sweeps, newton = (simulate("four_bar", 120, 5.0, s).speed for s in ("sequential_impulses", "newton"))
+    sweeps, newton = (
+        simulate("four_bar", 120, 5.0, s).speed for s in ("sequential_impulses", "newton")
+    )
     assert sweeps == pytest.approx(3.8, rel=0.05) and newton < 0.1  # m/s
     result = simulate("four_bar", 120, 3.0, "newton", position_iterations=0)
     assert (result.lost, result.failed) == ("", 0)

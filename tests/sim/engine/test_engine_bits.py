@@ -30,7 +30,10 @@ def trajectory(sim, steps):
     for _ in range(steps):
         seen = sim.step()[0]
         keys = "positions", "quaternions", "velocities", "joint_impulses", "solver"
-        out += [np.asarray(x).tobytes() for x in (*(seen[key] for key in keys), *seen["contacts"].values())]
+        out += [
+            np.asarray(x).tobytes()
+            for x in (*(seen[key] for key in keys), *seen["contacts"].values())
+        ]
     return out
 
 
@@ -67,7 +70,9 @@ def moved(sim, folder):
     size = sim.state.size.copy()
     size[8:] += 100
     twin.state = State(size)
-    memory.move_engine_state(*((s.size, s.real, s.index, s.keys)[i] for s in (sim.state, twin.state) for i in range(4)))
+    memory.move_engine_state(
+        *((s.size, s.real, s.index, s.keys)[i] for s in (sim.state, twin.state) for i in range(4))
+    )
     return twin
 
 
@@ -105,7 +110,11 @@ WAYS = {  # steps that were done before
 
 
 @pytest.mark.parametrize(
-    ("name", "more"), [*((name, {"order": "random"}) for name in SCENES), ("stack", {"solver": "block_gauss_seidel"})]
+    ("name", "more"),
+    [
+        *((name, {"order": "random"}) for name in SCENES),
+        ("stack", {"solver": "block_gauss_seidel"}),
+    ],
 )
 def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, more, tmp_path):
     scene = lv.Scene(name, seed=3, **SCENES[name], **more)
@@ -153,7 +162,9 @@ def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
 def test_simulation_beyond_its_buffers_raises_before_the_state_changes():
     sim = lv.Simulation("stack")
     state = with_room(sim.state, sim.state.size[8], 5)
-    before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
+    before = {
+        k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")
+    }
     assert state.kernel.run_substeps(3) == (1, 0)
     assert state.head[HEAD["need_contacts"]] == 24
     for key, value in before.items():

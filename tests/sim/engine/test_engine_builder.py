@@ -14,11 +14,27 @@ def make_scene():
     scene.add_box(position=(6.0, 0.0, 0.499))
     scene.add_joint("ball", -1, first, anchor=(0.0, 0.1, 4.0))
     scene.add_joint(
-        "hinge", first, second, anchor=(0.7, 0.0, 3.0), axis=(0.2, 1.0, 0.1), motor_speed=1.0, motor_torque=2.0
+        "hinge",
+        first,
+        second,
+        anchor=(0.7, 0.0, 3.0),
+        axis=(0.2, 1.0, 0.1),
+        motor_speed=1.0,
+        motor_torque=2.0,
     )
     scene.add_joint("hinge", ground, second, anchor=(1.6, 0.0, 3.0), axis=(0.0, 1.0, 0.0))
-    scene.add_joint("distance", first, second, anchor_a=(0.0, 0.0, 3.4), anchor_b=(1.4, 0.1, 3.3), length=1.3)
-    scene.add_joint("distance", -1, second, anchor_a=(3.0, 0.0, 4.0), anchor_b=(2.0, 0.0, 3.3), hertz=3.0, damping=0.4)
+    scene.add_joint(
+        "distance", first, second, anchor_a=(0.0, 0.0, 3.4), anchor_b=(1.4, 0.1, 3.3), length=1.3
+    )
+    scene.add_joint(
+        "distance",
+        -1,
+        second,
+        anchor_a=(3.0, 0.0, 4.0),
+        anchor_b=(2.0, 0.0, 3.3),
+        hertz=3.0,
+        damping=0.4,
+    )
     return scene
 
 
@@ -26,7 +42,9 @@ def rebuild(sim, state, recorded, h):
     """Build the same joints and contacts by a builder; no correction of errors, as in LavenderSim's rigid rows."""
     rows = recorded.rows
     moving = state["body_of"].tolist()
-    builder = lv.RowBuilder(rows.inv_mass, rows.inv_inertia, rows.v_free, h, state["x"][moving], baumgarte=0.0)
+    builder = lv.RowBuilder(
+        rows.inv_mass, rows.inv_inertia, rows.v_free, h, state["x"][moving], baumgarte=0.0
+    )
 
     def world(body, local, offset=True):
         if body < 0:
@@ -42,7 +60,9 @@ def rebuild(sim, state, recorded, h):
             axes = world(joint.a, joint.axis_a, False), world(joint.b, joint.axis_b, False)
             builder.hinge(*pair, points[0], axes[0], points[1], axes[1])
             if joint.motor_torque:
-                builder.motor(*pair, axes[0], speed=joint.motor_speed, max_torque=joint.motor_torque)
+                builder.motor(
+                    *pair, axes[0], speed=joint.motor_speed, max_torque=joint.motor_torque
+                )
         elif joint.hertz == 0.0:
             builder.distance(*pair, *points, joint.length)
         else:
@@ -58,7 +78,14 @@ def rebuild(sim, state, recorded, h):
             )
     for i, pair in enumerate(rows.contact_body):
         mu = recorded.cones.mu[rows.n_joints + i]
-        builder.contact(*pair, state["point"][i], rows.normal[i], gap=state["gap"][i], mu=mu, tangent=rows.tangent[i])
+        builder.contact(
+            *pair,
+            state["point"][i],
+            rows.normal[i],
+            gap=state["gap"][i],
+            mu=mu,
+            tangent=rows.tangent[i],
+        )
     return builder.problem()
 
 

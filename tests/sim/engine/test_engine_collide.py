@@ -61,7 +61,8 @@ def test_collide_of_two_boxes_agrees_with_the_slow_twin(numbers):
     a = (half[0], np.zeros(3), convert_to_rotation_matrix(q[0]))
     b = (half[1], place, convert_to_rotation_matrix(q[1]))
     found = manifold(
-        ("box", 2 * half[0], {"quaternion": q[0]}), ("box", 2 * half[1], {"quaternion": q[1], "position": place})
+        ("box", 2 * half[0], {"quaternion": q[0]}),
+        ("box", 2 * half[1], {"quaternion": q[1], "position": place}),
     )
     exact = separation(a, b)
     tol = 1e-3 * min(half[0].min(), half[1].min())
@@ -93,7 +94,10 @@ def test_collide_of_two_boxes_agrees_with_the_slow_twin(numbers):
 
 
 def test_collide_of_a_box_on_a_box_gives_the_four_corners_in_the_order_of_a_plane():
-    for below in (("plane", (0, 0, 1), {}), ("box", (2, 2, 2), {"position": (0, 0, -1), "mass": 0, "static": True})):
+    for below in (
+        ("plane", (0, 0, 1), {}),
+        ("box", (2, 2, 2), {"position": (0, 0, -1), "mass": 0, "static": True}),
+    ):
         found = manifold(below, ("box", (1, 0.6, 0.4), {"position": (0, 0, 0.2 - 1e-3)}))
         np.testing.assert_allclose(found["gap"], -1e-3, atol=1e-15)
         np.testing.assert_allclose(found["normal"], [[0, 0, 1]] * 4, atol=1e-15)
@@ -106,7 +110,8 @@ def test_crossed_edges_meet_in_one_point():
     other = [np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]
     z = np.sqrt(2) - 0.01
     found = manifold(
-        ("box", (2, 1, 1), {"quaternion": turn}), ("box", (1, 2, 1), {"quaternion": other, "position": (0.1, 0.2, z)})
+        ("box", (2, 1, 1), {"quaternion": turn}),
+        ("box", (1, 2, 1), {"quaternion": other, "position": (0.1, 0.2, z)}),
     )
     assert len(found["gap"]) == 1
     assert found["gap"][0] == pytest.approx(-0.01, abs=1e-12)
@@ -161,7 +166,9 @@ def overlapping(sim):
             n = a["shape"][k, :3]
             meet = n @ np.where(n > 0, low, high) <= a["shape"][k, 3]
         else:
-            meet = np.all(a["fat"][i, :3] <= a["fat"][j, 3:]) and np.all(a["fat"][j, :3] <= a["fat"][i, 3:])
+            meet = np.all(a["fat"][i, :3] <= a["fat"][j, 3:]) and np.all(
+                a["fat"][j, :3] <= a["fat"][i, 3:]
+            )
         if meet:
             out.add((i, j))
     return out
@@ -229,7 +236,9 @@ def test_warm_start_with_shuffled_or_false_keys_steps_as_without():
         elif kind == "false":
             a["cache_key"][:n] ^= np.uint64(0x155)  # features that do not exist
         elif kind == "rotated impulses":
-            a["cache_impulse"][:n] = np.roll(a["cache_impulse"][:n], 4, axis=0)  # those of another pair
+            a["cache_impulse"][:n] = np.roll(
+                a["cache_impulse"][:n], 4, axis=0
+            )  # those of another pair
         first = sim.step()[0]["solver"]
         for _ in range(120):
             observation = sim.step()[0]
@@ -273,7 +282,9 @@ def test_warm_start_impulses_turn_with_the_contact_frame():
     t2 = np.cross(contacts["normal"], contacts["tangent"])
     world = sum(
         i[0] * n + i[1] * t + i[2] * u
-        for i, n, t, u in zip(contacts["impulses"], contacts["normal"], contacts["tangent"], t2, strict=True)
+        for i, n, t, u in zip(
+            contacts["impulses"], contacts["normal"], contacts["tangent"], t2, strict=True
+        )
     )
     np.testing.assert_allclose(world, [0, 0, 9.81 / 120.0], atol=1e-12)
     guess = problem.guess.reshape(-1, 3)
@@ -301,10 +312,16 @@ def test_manifold_of_eight_points_keeps_the_deepest(seed):
     q = np.array([np.cos(turn / 2), *(0.5 * tilt), np.sin(turn / 2)])
     q /= np.linalg.norm(q)
     place = np.array([*rng.uniform(-0.1, 0.1, 2), 0.395])
-    found = manifold(("box", (2, 2, 0.4), {}), ("box", (2.2, 2.2, 0.4), {"quaternion": q, "position": place}))
+    found = manifold(
+        ("box", (2, 2, 0.4), {}), ("box", (2.2, 2.2, 0.4), {"quaternion": q, "position": place})
+    )
     r = convert_to_rotation_matrix(q)
-    below = place - 0.2 * r[:, 2]  # the centre of the lower face, whose points are below + r[:, :2] (u, v)
+    below = (
+        place - 0.2 * r[:, 2]
+    )  # the centre of the lower face, whose points are below + r[:, :2] (u, v)
     inside = np.vstack([r[:2, :2], -r[:2, :2]]), np.concatenate([1.0 - below[:2], 1.0 + below[:2]])
     deepest = linprog(r[2, :2], *inside, bounds=[(-1.1, 1.1)] * 2)
     assert len(found["gap"]) == 4
-    assert found["gap"].min() == pytest.approx(below[2] + deepest.fun - 0.2, abs=1e-3 * abs(below[2] - 0.2))
+    assert found["gap"].min() == pytest.approx(
+        below[2] + deepest.fun - 0.2, abs=1e-3 * abs(below[2] - 0.2)
+    )

@@ -37,13 +37,21 @@ def test_thrown_bodies_gain_no_energy_and_do_not_pass_through_the_ground(seed):
     scene = lv.Scene(dt=1 / 240, friction=rng.uniform())
     scene.add_plane()
     for i in range(8):
-        more = {"position": (*rng.uniform(-0.6, 0.6, 2), 1.0 + 1.5 * i), "mass": 10.0 ** rng.uniform(-1, 1)}
-        more |= {"velocity": rng.normal(scale=2.0, size=3), "angular_velocity": rng.normal(scale=3.0, size=3)}
+        more = {
+            "position": (*rng.uniform(-0.6, 0.6, 2), 1.0 + 1.5 * i),
+            "mass": 10.0 ** rng.uniform(-1, 1),
+        }
+        more |= {
+            "velocity": rng.normal(scale=2.0, size=3),
+            "angular_velocity": rng.normal(scale=3.0, size=3),
+        }
         if rng.integers(2):
             scene.add_sphere(rng.uniform(0.1, 0.4), **more)
         else:
             turned = rng.normal(size=4)
-            scene.add_box(rng.uniform(0.2, 0.8, 3), quaternion=turned / np.linalg.norm(turned), **more)
+            scene.add_box(
+                rng.uniform(0.2, 0.8, 3), quaternion=turned / np.linalg.norm(turned), **more
+            )
     sim = lv.Simulation(scene)
     start = energy(scene, sim.reset()[0])
     for _ in range(600):
@@ -60,7 +68,9 @@ def test_motion_has_the_same_bits_for_every_unit_of_mass(name):
     seen = run(own, 20)[1]
     for unit in (2.0**-40, 2.0**12, 2.0**40):
         other = lv.Scene(name)
-        other.bodies[:] = [replace(b, mass=unit * b.mass, inertia=unit * b.inertia) for b in own.bodies]
+        other.bodies[:] = [
+            replace(b, mass=unit * b.mass, inertia=unit * b.inertia) for b in own.bodies
+        ]
         scaled = run(other, 20)[1]
         for key in ("positions", "quaternions", "velocities"):
             assert seen[key].tobytes() == scaled[key].tobytes(), key
@@ -72,7 +82,11 @@ def test_scene_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape)
     """The bound on the motion of a substep is half of the body's thickness plus the margin, at any initial distance."""
     h = 1 / 240
     margin = 0.01
-    passed = {0.3: 0, 0.98: 0, 1.9: 0}  # Fractions of the bound; above 1 nothing is promised, and some pass.
+    passed = {
+        0.3: 0,
+        0.98: 0,
+        1.9: 0,
+    }  # Fractions of the bound; above 1 nothing is promised, and some pass.
     for share, size, wall in product(passed, (0.02, 0.2), (0.001, 0.1, None)):
         far = share * (0.5 * size + margin)  # m per substep
         for phase in (0.0, 0.2, 0.4, 0.6, 0.8, 0.999):
@@ -81,7 +95,10 @@ def test_scene_body_slower_than_the_documented_bound_does_not_pass_a_wall(shape)
                 scene.add_plane()
             else:
                 scene.add_box((2, 2, wall), position=(0, 0, -wall / 2), static=True)
-            place = {"position": (0.01, 0.02, 0.5 * size + margin + phase * far), "velocity": (0, 0, -far / h)}
+            place = {
+                "position": (0.01, 0.02, 0.5 * size + margin + phase * far),
+                "velocity": (0, 0, -far / h),
+            }
             if shape == "sphere":
                 scene.add_sphere(size / 2, **place)
             else:

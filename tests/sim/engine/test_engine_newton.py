@@ -30,7 +30,9 @@ SCENES = [
 def impulses(sim, observation):
     first = len(sim.state.a["joint_impulse"])
     rows = int(sim.state.head[1])
-    return np.concatenate([observation["joint_impulses"], sim.state.a["impulse"][first : first + rows]])
+    return np.concatenate(
+        [observation["joint_impulses"], sim.state.a["impulse"][first : first + rows]]
+    )
 
 
 @pytest.mark.parametrize(("name", "more"), SCENES)
@@ -45,9 +47,15 @@ def test_scene_step_by_newton_has_the_bits_of_solve(name, more):
             continue
         found = lv.solve(problem, "newton", max_iter=sim.solver_iterations)
         told = sim.last_solution
-        np.testing.assert_array_equal(impulses(sim, observation), found.impulse, err_msg=f"step {step}")
+        np.testing.assert_array_equal(
+            impulses(sim, observation), found.impulse, err_msg=f"step {step}"
+        )
         np.testing.assert_array_equal(told.impulse, found.impulse)
-        assert (told.status, dict(told.work), told.message) == (found.status, dict(found.work), found.message)
+        assert (told.status, dict(told.work), told.message) == (
+            found.status,
+            dict(found.work),
+            found.message,
+        )
         assert told.residual.relative == found.residual.relative
         assert told.claim_check == "confirmed"
         assert found.claim_check == "confirmed"
@@ -75,7 +83,9 @@ ONE = {"substeps": 1, "order": "given"}
 
 def problem_in(scene, step, **parameters):
     """What `step + 1` steps of a scene lead to, without its warm start."""
-    return dataclasses.replace(after(step + 1, scene, **parameters).constraint_problem(), guess=None)
+    return dataclasses.replace(
+        after(step + 1, scene, **parameters).constraint_problem(), guess=None
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,17 +117,24 @@ def test_scene_bridge_of_nearly_dependent_hinges_is_solved_by_newton(step, frict
     joints = rows[rows < problem.cones.ptr[problem.rows.n_joints]]
     smallest = np.linalg.eigvalsh(h[np.ix_(joints, joints)])[0]
     assert smallest < 1e-9  # far below what K K^T keeps beside contacts with W of 1e-10 to 1e10
-    solution = lv.solve(problem if law == "coulomb" else problem.relaxed("cone"), "newton", tol=1e-8)
+    solution = lv.solve(
+        problem if law == "coulomb" else problem.relaxed("cone"), "newton", tol=1e-8
+    )
     assert good(solution, 1e-8), str(solution)
 
 
 def test_scene_step_by_newton_keeps_the_best_point():
     problem = problem_in("table", 1, friction=1.0)
-    budgets = [lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)]
+    budgets = [
+        lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative
+        for n in (30, 60, 120, 240)
+    ]
     assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))
 
 
-@pytest.mark.parametrize(("scene", "parameters"), [("spinner", {}), ("stack", {"n": 1}), ("stack", {"n": 2})])
+@pytest.mark.parametrize(
+    ("scene", "parameters"), [("spinner", {}), ("stack", {"n": 1}), ("stack", {"n": 2})]
+)
 def test_scene_step_by_newton_with_a_full_factor_reaches_the_tolerance(scene, parameters):
     """The scratch of a substep is allocated before the analysis: it must hold the pattern of a full factor."""
     run = NewtonSteps(scene, warm_start=False, **parameters)
@@ -141,7 +158,9 @@ def test_scene_step_without_rows_flies_like_the_sweeps_and_builds_no_problem(sol
     def fly(name):
         scene = lv.Scene(dt=0.01, substeps=2, solver=name)
         scene.add_plane()
-        scene.add_box((0.4, 0.3, 0.1), position=(0, 0, 50.0), velocity=(1, 2, 3), angular_velocity=(3, 1, 2))
+        scene.add_box(
+            (0.4, 0.3, 0.1), position=(0, 0, 50.0), velocity=(1, 2, 3), angular_velocity=(3, 1, 2)
+        )
         sim = lv.Simulation(scene)
         for _ in range(20):
             observation = sim.step()[0]

@@ -56,7 +56,9 @@ def test_scene_restitution_gives_its_speed_and_slow_contacts_do_not_bounce():
 @pytest.mark.parametrize("e", [1.0, 0.5])
 def test_scene_restitution_under_gravity_returns_the_speed_before_the_step_in_fifty_bounces(e):
     """Each bounce returns e times the speed of the step before; with e = 1 the ball never climbs."""
-    scene = lv.Scene(restitution=e, friction=0.0, dt=1.0 / 240.0, substeps=1, restitution_threshold=0.0, slop=0.0)
+    scene = lv.Scene(
+        restitution=e, friction=0.0, dt=1.0 / 240.0, substeps=1, restitution_threshold=0.0, slop=0.0
+    )
     scene.add_plane()
     scene.add_sphere(0.5, position=(0, 0, 1.5))
     sim = lv.Simulation(scene)
@@ -93,7 +95,9 @@ def test_a_closed_system_keeps_its_momentum(kind):
 
     def momentum(o):
         linear, angular = np.zeros(3), np.zeros(3)
-        for b, x, q, v in zip(scene.bodies, o["positions"], o["quaternions"], o["velocities"], strict=True):
+        for b, x, q, v in zip(
+            scene.bodies, o["positions"], o["quaternions"], o["velocities"], strict=True
+        ):
             r = convert_to_rotation_matrix(q)
             linear += b.mass * v[:3]
             angular += np.cross(x, b.mass * v[:3]) + r @ b.inertia @ r.T @ v[3:]
@@ -117,7 +121,9 @@ def test_scene_motor_turns_its_joint_within_its_torque():
     assert speed == pytest.approx(2.0, rel=1e-3)
     weak = lv.Simulation(lv.Scene("four_bar", motor=50.0, torque=3.0))
     impulses = run(weak, 5)["joint_impulses"]
-    assert impulses[5] == pytest.approx(3.0 / 240.0, rel=1e-12)  # torque times the substep, at its bound
+    assert impulses[5] == pytest.approx(
+        3.0 / 240.0, rel=1e-12
+    )  # torque times the substep, at its bound
 
 
 def slope(angle, turned, shape, **more):

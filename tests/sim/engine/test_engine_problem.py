@@ -20,7 +20,10 @@ def reported(observation, problem):
     """Impulses of a step in the order of the problem's rows."""
     contacts = observation["contacts"]["impulses"]
     size = np.diff(problem.cones.ptr)[problem.rows.n_joints :]
-    parts = [observation["joint_impulses"], *(row[:n] for row, n in zip(contacts, size, strict=True))]
+    parts = [
+        observation["joint_impulses"],
+        *(row[:n] for row, n in zip(contacts, size, strict=True)),
+    ]
     return np.concatenate(parts)
 
 
@@ -37,11 +40,25 @@ ROWS_OF_CONTACTS = (
 @pytest.mark.parametrize(
     ("name", "more"),
     [
-        *((name, {"warm_start": warm, "solver_iterations": 9}) for name in SCENES for warm in (True, False)),
-        *((name, {"order": order, "seed": 5}) for name in ("stack", "bridge", "pyramid") for order in SCENE_ORDERS),
+        *(
+            (name, {"warm_start": warm, "solver_iterations": 9})
+            for name in SCENES
+            for warm in (True, False)
+        ),
+        *(
+            (name, {"order": order, "seed": 5})
+            for name in ("stack", "bridge", "pyramid")
+            for order in SCENE_ORDERS
+        ),
         *(("stack", {"n": 8} | more) for more in ROWS_OF_CONTACTS),
-        *(("pyramid", {"base": 6, "friction": 0.05, "friction_shape": "disk"} | more) for more in ROWS_OF_CONTACTS[1:]),
-        *(("pile", {"n": 60, "rolling_radius": 0.0, "patch_radius": 0.0, "friction": mu}) for mu in (0.0, 0.5)),
+        *(
+            ("pyramid", {"base": 6, "friction": 0.05, "friction_shape": "disk"} | more)
+            for more in ROWS_OF_CONTACTS[1:]
+        ),
+        *(
+            ("pile", {"n": 60, "rolling_radius": 0.0, "patch_radius": 0.0, "friction": mu})
+            for mu in (0.0, 0.5)
+        ),
         ("stack", {"n": 1}),
         ("table", {}),
         ("newtons_cradle", {}),
@@ -51,7 +68,9 @@ def test_step_has_the_bits_and_residuals_of_solve(name, more):
     sim = lv.Simulation(lv.Scene(name, substeps=1, **SCENES.get(name, {}) | more))
     rows = 0
     order = sim.scene.parameters.order
-    asked = {} if order == "alternating" else {"order": order}  # whose contacts stand as they are swept
+    asked = (
+        {} if order == "alternating" else {"order": order}
+    )  # whose contacts stand as they are swept
     for _ in range(30):
         problem = sim.constraint_problem()
         asked |= {"seed": sim.sweep_seed()} if order == "random" else {}
@@ -110,7 +129,10 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
         with pytest.raises(lv.InputError, match="another scene"):
             lv.Simulation(lv.Scene("stack", **{"n": 3, **other})).load(path)
     data = path.read_bytes()
-    cut, *flipped = (data[:-40], *(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :] for k in (5, len(data) // 2, -33)))
+    cut, *flipped = (
+        data[:-40],
+        *(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :] for k in (5, len(data) // 2, -33)),
+    )
     for bad in (cut, *flipped):
         path.write_bytes(bad)
         with pytest.raises(lv.InputError, match=r"does not begin as a snapshot|damaged"):
@@ -139,7 +161,9 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
         with pytest.raises(lv.InputError, match="do not have the sizes"):
             sim.restore(replace(shot, **{name: getattr(shot, name)[:-1]}))
     with pytest.raises(lv.InputError, match="its sizes differ from the sizes of this scene"):
-        sim.restore(replace(lv.Simulation(lv.Scene("stack", n=4)).snapshot(), fingerprint=shot.fingerprint))
+        sim.restore(
+            replace(lv.Simulation(lv.Scene("stack", n=4)).snapshot(), fingerprint=shot.fingerprint)
+        )
     alone = lv.Scene()  # no pair, no contact: arrays of one entry or none
     alone.add_sphere()
     one = after(2, alone)
@@ -148,9 +172,13 @@ def test_restore_of_a_foreign_or_damaged_snapshot_raises(tmp_path):
 
 
 @pytest.mark.parametrize("rolling", [0.0, 0.01])
-@pytest.mark.parametrize("name", [n for n in lv.available(external=False) if "cone" in lv.get(n).laws or n == "pgs"])
+@pytest.mark.parametrize(
+    "name", [n for n in lv.available(external=False) if "cone" in lv.get(n).laws or n == "pgs"]
+)
 def test_scene_step_by_any_registered_solver_runs(name, rolling):
-    sim = lv.Simulation(lv.Scene("stack", n=3, solver=name, solver_iterations=2000, rolling_radius=rolling))
+    sim = lv.Simulation(
+        lv.Scene("stack", n=3, solver=name, solver_iterations=2000, rolling_radius=rolling)
+    )
     for _ in range(30):
         observation, *_, info = sim.step()
     assert sim.last_solution.solver.name == name
@@ -193,11 +221,15 @@ def test_step_after_a_failed_solve_follows_on_failure(policy):
 
 
 def test_scene_residual_of_all_rows_is_that_of_the_judge():
-    sim = lv.Simulation(lv.Scene("bridge", n=6, patch_radius=0.05, substeps=1), report_residual=True)
+    sim = lv.Simulation(
+        lv.Scene("bridge", n=6, patch_radius=0.05, substeps=1), report_residual=True
+    )
     for _ in range(50):
         problem = sim.constraint_problem()
         *_, info = sim.step()
-    judged = lv.residual(problem, lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse)
+    judged = lv.residual(
+        problem, lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
+    )
     assert info["residual"]["relative"] == judged.relative
     assert info["residual"]["energy"] == judged.energy
     assert info["residual"]["worst"] == judged.worst_name
@@ -205,22 +237,36 @@ def test_scene_residual_of_all_rows_is_that_of_the_judge():
     assert set(share) == {"joint", "normal", "disk", "spin"}
     assert sum(share.values()) == pytest.approx(1.0, abs=1e-12)  # four shares of one sum
     energy = problem.d * judged.error**2
-    assert share["joint"] == pytest.approx(energy[: len(problem.rows.jac)].sum() / energy.sum(), rel=1e-12)
+    assert share["joint"] == pytest.approx(
+        energy[: len(problem.rows.jac)].sum() / energy.sum(), rel=1e-12
+    )
 
 
 def test_shares_of_the_residual_of_rolling_contacts_are_those_of_numpy():
     scene = lv.Scene(rolling_radius=0.03, patch_radius=0.02, substeps=1)
     scene.add_plane()
     for i in range(6):
-        scene.add_sphere(0.2, position=(0.1 * i, 0.2 * i % 0.3, 0.2 + 0.3 * i), angular_velocity=(1.0, 2.0, 3.0))
+        scene.add_sphere(
+            0.2, position=(0.1 * i, 0.2 * i % 0.3, 0.2 + 0.3 * i), angular_velocity=(1.0, 2.0, 3.0)
+        )
     sim = lv.Simulation(scene, report_residual=True)
     for _ in range(40):
         problem = sim.constraint_problem()
         observation, *_, info = sim.step()
-    energy = problem.d * lv.residual(problem, observation["contacts"]["impulses"].ravel()).error ** 2
+    energy = (
+        problem.d * lv.residual(problem, observation["contacts"]["impulses"].ravel()).error ** 2
+    )
     sums = energy.reshape(-1, 6).sum(axis=0) / energy.sum()
-    expected = {"joint": 0.0, "normal": sums[0], "disk": sums[1:3].sum(), "spin": sums[3], "rolling": sums[4:].sum()}
-    assert info["residual"]["share"] == pytest.approx(expected, rel=1e-9) and expected["rolling"] > 0.0
+    expected = {
+        "joint": 0.0,
+        "normal": sums[0],
+        "disk": sums[1:3].sum(),
+        "spin": sums[3],
+        "rolling": sums[4:].sum(),
+    }
+    assert (
+        info["residual"]["share"] == pytest.approx(expected, rel=1e-9) and expected["rolling"] > 0.0
+    )
 
 
 def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):

@@ -11,7 +11,12 @@ G = 9.81
 def ball(rolling=0.02, speed=2.0, radius=0.5, **more):
     scene = lv.Scene(rolling_radius=rolling, **more)
     scene.add_plane()
-    scene.add_sphere(radius, position=(0, 0, radius), velocity=(speed, 0, 0), angular_velocity=(0, speed / radius, 0))
+    scene.add_sphere(
+        radius,
+        position=(0, 0, radius),
+        velocity=(speed, 0, 0),
+        angular_velocity=(0, speed / radius, 0),
+    )
     return lv.Simulation(scene)
 
 
@@ -46,7 +51,9 @@ def test_warm_start_restores_rolling_moments():
     for sim in (warm, cold):
         for _ in range(400):
             sim.step()
-    a, b = (lv.residual(s.constraint_problem(), s.constraint_problem().start()) for s in (warm, cold))
+    a, b = (
+        lv.residual(s.constraint_problem(), s.constraint_problem().start()) for s in (warm, cold)
+    )
     guess = warm.constraint_problem().guess
     rows = warm.constraint_problem().cones.rolling_rows
     assert np.abs(guess[rows[rows >= 0]]).max() > 0.0
@@ -61,7 +68,9 @@ def test_ball_without_a_patch_rolls_next_to_balls_with_one():
     scene = lv.Scene(rolling_radius=0.05, substeps=1)
     scene.add_plane(patch_radius=0.1)
     for i, patch in enumerate((0.1, 0.0)):
-        scene.add_sphere(0.5, position=(2.0 * i, 0, 0.5), angular_velocity=(0, 4.0, 9.0), patch_radius=patch)
+        scene.add_sphere(
+            0.5, position=(2.0 * i, 0, 0.5), angular_velocity=(0, 4.0, 9.0), patch_radius=patch
+        )
     sim = lv.Simulation(scene)
     for _ in range(5):
         problem = sim.constraint_problem()
@@ -71,4 +80,6 @@ def test_ball_without_a_patch_rolls_next_to_balls_with_one():
     impulses = seen["contacts"]["impulses"]
     assert not impulses[sizes == 5, 3].any() and impulses[sizes == 6, 3].all()
     # Where it slips the moment is at its bound.
-    np.testing.assert_allclose(np.linalg.norm(impulses[:, 4:], axis=1), 0.05 * impulses[:, 0], rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(impulses[:, 4:], axis=1), 0.05 * impulses[:, 0], rtol=1e-9
+    )

@@ -106,7 +106,9 @@ def test_spinning_ball_slows_linearly_by_torsional_friction(mu, spin):
     scene.add_sphere(0.5, position=(0.0, 0.0, 0.5), angular_velocity=(0.0, 0.0, spin))
     seconds = spin * 0.4 * 0.25 / (mu * patch * G)  # Inertia 2/5 m R^2, torque mu r m g.
     time, _, _, v = record(scene, seconds + 0.5)
-    np.testing.assert_allclose(v[:, 1, 5], spin * np.maximum(0.0, 1.0 - time / seconds), rtol=0, atol=1e-9 * spin)
+    np.testing.assert_allclose(
+        v[:, 1, 5], spin * np.maximum(0.0, 1.0 - time / seconds), rtol=0, atol=1e-9 * spin
+    )
 
 
 def test_pendulum_period_is_exact_and_energy_loss_falls_with_substep():
@@ -124,7 +126,9 @@ def test_pendulum_period_is_exact_and_energy_loss_falls_with_substep():
         scene.add_joint("hinge", -1, rod, anchor=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
         time, x, _, v = record(scene, 5 * exact)
         # The period falls with the amplitude, which the lost energy reduces: by 1 % in five swings.
-        assert find_period(time, np.arctan2(x[:, 0, 0], -x[:, 0, 2])) == pytest.approx(exact, rel=0.02)
+        assert find_period(time, np.arctan2(x[:, 0, 0], -x[:, 0, 2])) == pytest.approx(
+            exact, rel=0.02
+        )
         energy = 0.5 * (v[:, 0, :3] ** 2).sum(axis=1) + G * x[:, 0, 2]
         energy += 0.5 * (1 + side**2) / 12 * v[:, 0, 4] ** 2
         losses.append(energy[0] - energy[-1])
@@ -144,7 +148,9 @@ def test_free_body_flips_with_exact_period_and_keeps_energy_and_momentum(spin):
     if squared < energy * i2:
         i1, i3 = i3, i1
     scale = (i3 - i2) * (squared - energy * i1)
-    exact = 4.0 * ellipk((i2 - i1) * (energy * i3 - squared) / scale) * math.sqrt(i1 * i2 * i3 / scale)
+    exact = (
+        4.0 * ellipk((i2 - i1) * (energy * i3 - squared) / scale) * math.sqrt(i1 * i2 * i3 / scale)
+    )
 
     scene = make_scene(0.0)
     scene.add_box(tuple(edges), angular_velocity=tuple(omega0))
@@ -154,7 +160,9 @@ def test_free_body_flips_with_exact_period_and_keeps_energy_and_momentum(spin):
     momentum = np.einsum("kij,kj->ki", rotations, inertia * omega)
     assert find_period(time, omega[:, 1]) == pytest.approx(exact, rel=0.01)
     np.testing.assert_allclose(omega**2 @ inertia, energy, rtol=0.01)
-    np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(time), 1)), atol=0.01 * math.sqrt(squared))
+    np.testing.assert_allclose(
+        momentum, np.tile(momentum[0], (len(time), 1)), atol=0.01 * math.sqrt(squared)
+    )
 
 
 @pytest.mark.parametrize("ratio", [1.0, 100.0, 1e4])
@@ -191,9 +199,13 @@ def test_tall_box_tips_after_exact_time_if_slope_exceeds_its_base(solver, ratio)
         return y[0] - angle
 
     exceed.terminal = True
-    exact = solve_ivp(accelerate, (0, 20), [0.0, 0.0], events=exceed, rtol=1e-10, atol=1e-13).t_events[0][0]
+    exact = solve_ivp(
+        accelerate, (0, 20), [0.0, 0.0], events=exceed, rtol=1e-10, atol=1e-13
+    ).t_events[0][0]
     time, _, q, _ = record(scene, exact + 0.5)
-    tilt = np.arccos(np.array([convert_to_rotation_matrix(one)[2, 2] for one in q[:, 1]]).clip(-1, 1))
+    tilt = np.arccos(
+        np.array([convert_to_rotation_matrix(one)[2, 2] for one in q[:, 1]]).clip(-1, 1)
+    )
     # Three samples.
     assert find_crossing_time(time, -tilt, -angle) == pytest.approx(exact, abs=0.05)
 
@@ -258,10 +270,26 @@ def make_arch(thickness, stones=4, slope=0.5, **parameters):
         (lambda: make_overhang(0.98, 5), True),
         (lambda: make_arch(1.05), True),
         (lambda: make_arch(0.95), False),
-        (lambda: lv.Scene("heavy_on_light", n=3, ratio=1e4, gravity=G, dt=DT, friction=0.5, **NEWTON), True),
-        (lambda: lv.Scene("heavy_on_light", n=3, ratio=100.0, gravity=G, dt=DT, friction=0.5), True),
+        (
+            lambda: lv.Scene(
+                "heavy_on_light", n=3, ratio=1e4, gravity=G, dt=DT, friction=0.5, **NEWTON
+            ),
+            True,
+        ),
+        (
+            lambda: lv.Scene("heavy_on_light", n=3, ratio=100.0, gravity=G, dt=DT, friction=0.5),
+            True,
+        ),
     ],
-    ids=["overhang 10", "too far 10", "overhang 5, sweeps", "arch", "too thin", "heavy newton", "heavy sweeps"],
+    ids=[
+        "overhang 10",
+        "too far 10",
+        "overhang 5, sweeps",
+        "arch",
+        "too thin",
+        "heavy newton",
+        "heavy sweeps",
+    ],
 )
 def test_scene_structure_stands_exactly_if_statics_allows(scene, stands):
     _, x, _, _ = record(scene(), 8.0)

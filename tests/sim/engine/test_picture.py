@@ -23,7 +23,9 @@ def test_film_of_a_moving_ball_shows_its_projected_path(tmp_path):
         for k in range(3):
             pictures.seek(k)
             colors = np.asarray(pictures.convert("RGB"), float)
-            rows, columns = np.nonzero(colors.max(axis=2) - colors.min(axis=2) > 40.0)  # The title is grey.
+            rows, columns = np.nonzero(
+                colors.max(axis=2) - colors.min(axis=2) > 40.0
+            )  # The title is grey.
             centres.append([columns.mean(), -rows.mean()])
             diameter = np.ptp(columns) + 1.0
     turn, tilt = 0.45, 0.22

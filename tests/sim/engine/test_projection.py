@@ -21,7 +21,9 @@ def test_heavy_cube_at_rest_without_slop_stays_where_it_is(ratio):
     start = sim.reset()[0]["positions"]
     for _ in range(3500):
         found = sim.step()[0]["positions"]
-    np.testing.assert_allclose(found, start, atol=1e-6)  # round-off, 1e-9 m measured, which no step amplifies
+    np.testing.assert_allclose(
+        found, start, atol=1e-6
+    )  # round-off, 1e-9 m measured, which no step amplifies
 
 
 @pytest.mark.parametrize("ratio", [1.0, 10.0, 100.0, 1000.0])

@@ -17,10 +17,26 @@ def test_scene_of_one_box_gives_the_documented_observation():
     observation, reward, terminated, truncated, info = lv.Simulation(scene).step()
     assert (reward, terminated, truncated) == (0.0, False, False)
     assert info == {"time": 0.01, "step": 1, "failed_solves": 0, "order": "alternating"}
-    assert set(observation) == {"positions", "quaternions", "velocities", "contacts", "joint_impulses", "solver"}
-    assert set(observation["contacts"]) == {"pair", "point", "normal", "tangent", "depth", "impulses"}
+    assert set(observation) == {
+        "positions",
+        "quaternions",
+        "velocities",
+        "contacts",
+        "joint_impulses",
+        "solver",
+    }
+    assert set(observation["contacts"]) == {
+        "pair",
+        "point",
+        "normal",
+        "tangent",
+        "depth",
+        "impulses",
+    }
     # 2 kg held over the last of the three substeps of 10 ms
-    assert observation["contacts"]["impulses"][:, 0].sum() == pytest.approx(2.0 * 9.81 * 0.01 / 3, rel=1e-3)
+    assert observation["contacts"]["impulses"][:, 0].sum() == pytest.approx(
+        2.0 * 9.81 * 0.01 / 3, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -73,7 +89,9 @@ def test_scene_without_friction_or_spin_allocates_no_rows():
 def test_scene_contacts_have_only_the_rows_of_their_friction():
     scene = lv.Scene(friction=0.0, patch_radius=0.2, substeps=1)
     scene.add_plane(friction=0.5)
-    scene.add_sphere(position=(0, 0, 0.5), friction=0.5, velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
+    scene.add_sphere(
+        position=(0, 0, 0.5), friction=0.5, velocity=(1, 0, 0), angular_velocity=(0, 0, 3)
+    )
     scene.add_sphere(position=(2, 0, 0.5))
     scene.add_sphere(position=(4, 0, 0.5), friction=0.2, patch_radius=0.0)
     sim = lv.Simulation(scene)
@@ -85,7 +103,9 @@ def test_scene_contacts_have_only_the_rows_of_their_friction():
     assert impulses[0, 2] != 0.0 and impulses[0, 3] != 0.0  # sliding along x, spinning
     assert np.all(impulses[1, 1:] == 0.0) and impulses[2, 3] == 0.0
     expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
-    np.testing.assert_array_equal(np.concatenate([impulses[0], impulses[1, :1], impulses[2, :3]]), expected)
+    np.testing.assert_array_equal(
+        np.concatenate([impulses[0], impulses[1, :1], impulses[2, :3]]), expected
+    )
 
 
 #: Calls of a scene with a ball and a plane, or of no scene, and words of their errors.
@@ -118,8 +138,14 @@ REFUSED = [
     (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1)), "axis"),
     (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0)), "axis"),
     (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 0)), "direction"),
-    (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1), motor_speed=1.0), "motor"),
-    (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), motor_speed=1.0, motor_torque=1.0), "motor"),
+    (
+        lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1), motor_speed=1.0),
+        "motor",
+    ),
+    (
+        lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), motor_speed=1.0, motor_torque=1.0),
+        "motor",
+    ),
     (lambda s: s.add_joint("distance", 0, -1), "anchor"),
     (lambda s: s.add_joint("distance", 0, -1, anchor_a=(0, 0, 0), anchor_b=(0, 0, 0)), "length 0"),
     (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
@@ -171,13 +197,19 @@ def test_scene_with_a_wrong_part_or_parameter_raises_and_adds_nothing(call, word
 
 @pytest.mark.parametrize(
     ("solver", "velocity", "spin"),  # of the second, rows whose impulses are far from all others
-    [("sequential_impulses", (1e60, 0, 0), 0), ("pgs", (1e60, 0, -1e55), 1e55), ("newton", (1e60, 0, 0), 0)],
+    [
+        ("sequential_impulses", (1e60, 0, 0), 0),
+        ("pgs", (1e60, 0, -1e55), 1e55),
+        ("newton", (1e60, 0, 0), 0),
+    ],
 )
 def test_step_with_a_lost_state_names_its_body_and_ends_the_simulation(solver, velocity, spin):
     scene = lv.Scene(solver=solver)
     scene.add_plane()
     scene.add_sphere(position=(0, 0, 0.5), name="fine")
-    scene.add_sphere(position=(5, 0, 0.5), velocity=velocity, angular_velocity=(0, spin, 0), name="gone")
+    scene.add_sphere(
+        position=(5, 0, 0.5), velocity=velocity, angular_velocity=(0, spin, 0), name="gone"
+    )
     sim = lv.Simulation(scene)
     before = sim.snapshot()
     for _ in range(400):

@@ -24,7 +24,9 @@ print(json.dumps({name: hashed(name) for name in SCENES}))
 
 
 def starts(**environment):
-    return json.loads(python("-W", "ignore", "-c", STARTS, env={**os.environ, **environment}).stdout)
+    return json.loads(
+        python("-W", "ignore", "-c", STARTS, env={**os.environ, **environment}).stdout
+    )
 
 
 def test_every_scene_starts_from_the_same_bits_without_the_instructions_of_new_processors():

@@ -15,13 +15,17 @@ def boxes(velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), **paramete
     scene.add_plane()
     for i in range(3):
         moving = {"velocity": velocity, "angular_velocity": angular_velocity} if i == 1 else {}
-        scene.add_box((1.0, 1.0, 0.5), position=(0.0, 0.0, 0.25 + 0.5 * i), name=f"box {i}", **moving)
+        scene.add_box(
+            (1.0, 1.0, 0.5), position=(0.0, 0.0, 0.25 + 0.5 * i), name=f"box {i}", **moving
+        )
     return scene
 
 
 @pytest.mark.parametrize("body", [2, "box 1"])
 @pytest.mark.parametrize(
-    "parameters", [{}, {"solver": "newton"}, {"restitution": 0.5}], ids=lambda parameters: str(*parameters.values())
+    "parameters",
+    [{}, {"solver": "newton"}, {"restitution": 0.5}],
+    ids=lambda parameters: str(*parameters.values()),
 )
 def test_set_velocity_gives_the_bits_of_a_scene_that_begins_with_it(parameters, body):
     sim = lv.Simulation(boxes(**parameters))
@@ -38,7 +42,11 @@ def test_set_velocity_keeps_published_arrays(solver):
     published = sim.residual(), str(sim.last_solution and sim.last_solution.residual), sim.time
     before = sim.snapshot()
     sim.set_velocity("box 2", LINEAR, ANGULAR)
-    assert (sim.residual(), str(sim.last_solution and sim.last_solution.residual), sim.time) == published
+    assert (
+        sim.residual(),
+        str(sim.last_solution and sim.last_solution.residual),
+        sim.time,
+    ) == published
     after = sim.snapshot()
     assert np.flatnonzero(before.real != after.real).size == 6
     assert (before.index == after.index).all() and (before.keys == after.keys).all()

@@ -68,7 +68,16 @@ def test_scene_stack_in_whole_steps_and_given_order_drifts():
 
 @pytest.mark.parametrize(
     ("dt", "substeps"),
-    [(1 / 60, 4), (1 / 120, 2), (1 / 240, 1), (1 / 50, 5), (1 / 100, 3), (1 / 1000, 1), (1 / 30, 8), (0.1, 24)],
+    [
+        (1 / 60, 4),
+        (1 / 120, 2),
+        (1 / 240, 1),
+        (1 / 50, 5),
+        (1 / 100, 3),
+        (1 / 1000, 1),
+        (1 / 30, 8),
+        (0.1, 24),
+    ],
 )
 def test_scene_substeps_are_no_longer_than_the_maximum(dt, substeps):
     assert lv.Scene("stack", dt=dt).parameters.substeps == substeps
@@ -119,7 +128,9 @@ def test_bearing_contact_within_the_slop_is_in_place():
         head[HEAD["warm_start"]] = warm
         problem = sim.constraint_problem()
         a["x"][:], head[HEAD["warm_start"]] = kept
-        return (problem.b + problem.rows.jacobian(problem.cones) @ problem.rows.v_free.ravel())[problem.cones.ptr[:-1]]
+        return (problem.b + problem.rows.jacobian(problem.cones) @ problem.rows.v_free.ravel())[
+            problem.cones.ptr[:-1]
+        ]
 
     h, slop = p.dt, p.slop
     np.testing.assert_allclose(targets(0.5 * slop, True), 0.0, atol=1e-13)

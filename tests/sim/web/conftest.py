@@ -33,7 +33,9 @@ def address(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed (extra: dev)"
+    )
     found = chromium()
     with playwright.sync_playwright() as p:
         # Containers and root have no user namespaces to build the sandbox from.
@@ -65,7 +67,9 @@ class Visit:
         self.context = page.context
         self.address = address
         self.complaints, self.requests = [], []
-        self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text))
+        self.page.on(
+            "console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text)
+        )
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
         self.page.on("request", lambda request: self.requests.append(request.url))
@@ -78,7 +82,9 @@ class Visit:
     def values(self, i):
         """The eight values of a side: exactly, and as they are shown."""
         cells = [self.side(i).locator(f"td[data-field='{field}']") for field in SOLVER_FIELDS]
-        return [float(c.get_attribute("data-value")) for c in cells], [c.text_content() for c in cells]
+        return [float(c.get_attribute("data-value")) for c in cells], [
+            c.text_content() for c in cells
+        ]
 
     def js(self, expression):
         return self.page.evaluate(expression)
@@ -89,10 +95,14 @@ def visit(new_page, address):
     visits = []
 
     def start(path="#stack", at=address, **options):
-        visits.append(Visit(new_page(**{"viewport": {"width": 1280, "height": 900}, **options}), at + path))
+        visits.append(
+            Visit(new_page(**{"viewport": {"width": 1280, "height": 900}, **options}), at + path)
+        )
         return visits[-1]
 
     yield start
     for v in visits:
         assert v.complaints == []
-        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {v.address.rsplit("/", 1)[0]}
+        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {
+            v.address.rsplit("/", 1)[0]
+        }

@@ -20,7 +20,14 @@ import lavender as lv
 from lavender.sim.web.scenes import describe_layout, describe_snapshot
 
 STEPS = 300
-BLOW = [1.5, 0.2, -1.0, 0.0, 3.0, 0.1]  # m/s, rad/s: set before the snapshot that the replay makes at step 149, too
+BLOW = [
+    1.5,
+    0.2,
+    -1.0,
+    0.0,
+    3.0,
+    0.1,
+]  # m/s, rad/s: set before the snapshot that the replay makes at step 149, too
 BODY_ARRAYS = ("x", "q", "v")
 
 #: Gallery scene, parameters, and what is changed before which step.
@@ -91,9 +98,17 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
             simulation.set_velocity(body, v[:3], v[3:])
         observation = simulation.step()[0]
         shot = simulation.snapshot()
-        states.append(np.concatenate([observation[key].ravel() for key in ("positions", "quaternions", "velocities")]))
+        states.append(
+            np.concatenate(
+                [observation[key].ravel() for key in ("positions", "quaternions", "velocities")]
+            )
+        )
         values.append(observation["solver"])
-        hashes.append(hashlib.sha256(shot.real.tobytes() + shot.index.tobytes() + shot.keys.tobytes()).digest())
+        hashes.append(
+            hashlib.sha256(
+                shot.real.tobytes() + shot.index.tobytes() + shot.keys.tobytes()
+            ).digest()
+        )
     given = ", ".join(f"{key}={value}" for key, value in parameters.items())
     return {
         "name": f"{name}({given})",
@@ -144,7 +159,12 @@ def record(folder, steps=STEPS):
     writer = Writer()
     scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
     newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
-    contents = {"layout": describe_layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "newton": newton}
+    contents = {
+        "layout": describe_layout(),
+        "body_arrays": BODY_ARRAYS,
+        "scenes": scenes,
+        "newton": newton,
+    }
     path = Path(folder) / "recording.json"
     path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
     path.with_suffix(".bin").write_bytes(b"".join(writer.parts))

@@ -21,7 +21,9 @@ CHECK = HERE / "check_wasm_exports.mjs"
 # Left out where the kernels run with every check on: the module is compiled without them either way.
 pytestmark = pytest.mark.slow
 
-needs_compiler = pytest.mark.skipif(bool(wasm.explain_missing_requirement()), reason=wasm.explain_missing_requirement())
+needs_compiler = pytest.mark.skipif(
+    bool(wasm.explain_missing_requirement()), reason=wasm.explain_missing_requirement()
+)
 
 
 @pytest.fixture(scope="session")
@@ -33,7 +35,10 @@ def recording(tmp_path_factory):
 
 
 HEAD = "from libc.stdint cimport int32_t\n"
-GOOD = HEAD + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
+GOOD = (
+    HEAD
+    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
+)
 
 
 @needs_compiler
@@ -61,7 +66,9 @@ def test_wasm_module_has_the_documented_size_and_can_grow(name, request):
 def node(*arguments):
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
-    return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        ["node", *map(str, arguments)], capture_output=True, text=True, check=False
+    )
 
 
 @pytest.fixture(scope="session")
@@ -80,7 +87,9 @@ def test_wasm_module_has_the_bits_of_the_native_engine(module_file, recording):
 
 def test_page_scenes_are_the_start_of_native_ones():
     contents = json.loads(json.dumps(collect_page_data()))
-    gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
+    gallery = [
+        name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"
+    ]
     assert sorted(scene["name"] for scene in contents["scenes"]) == sorted(gallery)
     for scene in contents["scenes"]:
         start = lv.Simulation(scene["name"]).snapshot()
@@ -95,22 +104,31 @@ def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
     if node is None:
         pytest.skip("node is not installed")
     pages.write_page(tmp_path)
-    output = subprocess.run([node, HERE / "preset_results.mjs", tmp_path], check=True, capture_output=True, text=True)
+    output = subprocess.run(
+        [node, HERE / "preset_results.mjs", tmp_path], check=True, capture_output=True, text=True
+    )
     results = json.loads(output.stdout)
     page = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
     presets = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
     for preset in presets:
         if captions := results[preset["name"]]["captions"]:
-            (row,) = re.findall(rf"^\| {re.escape(preset['title'])}[^|]*\| (.*) \|$", page, re.MULTILINE)
+            (row,) = re.findall(
+                rf"^\| {re.escape(preset['title'])}[^|]*\| (.*) \|$", page, re.MULTILINE
+            )
             a, b = row.split("; ")
             assert captions[0] in a and captions[1] in b, (preset["name"], captions)
     chapter = (ROOT / "docs" / "chapter-answers.md").read_text(encoding="utf-8")
-    cells = [[cell.strip(" *") for cell in line.split("|")] for line in chapter.splitlines() if line.startswith("|")]
+    cells = [
+        [cell.strip(" *") for cell in line.split("|")]
+        for line in chapter.splitlines()
+        if line.startswith("|")
+    ]
     alternating = {(row[3]): row[7] for row in cells if len(row) == 9}
     few_many = {n["last"]: n["a"] / n["b"] for n in results["experiment=4"]["numbers"]}
     assert alternating["first solve"] == f"{few_many[0]:.1f}"
     assert (
-        alternating["steps 21–60"] == f"{few_many[60]:.0f}" and alternating["steps 181–240"] == f"{few_many[240]:.0f}"
+        alternating["steps 21–60"] == f"{few_many[60]:.0f}"
+        and alternating["steps 181–240"] == f"{few_many[240]:.0f}"
     )
     cold_warm = results["experiment=5"]["numbers"][0]
     assert alternating["steps 21–90"] == f"{cold_warm['b'] / cold_warm['a']:.0f}"

@@ -18,9 +18,13 @@ import lavender as lv
 from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
 from lavender.sim.web.scenes import PRESETS_PATH, write_scene
 
-pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
+pytestmark = (
+    pytest.mark.slow
+)  # the module is the same whatever checks the native kernels are built with
 
-Side = namedtuple("Side", ["iterations", "warm_start", "order", "solver"], defaults=["given", "sweeps"])
+Side = namedtuple(
+    "Side", ["iterations", "warm_start", "order", "solver"], defaults=["given", "sweeps"]
+)
 PRESETS = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
 for preset in PRESETS:
     preset["sides"] = [Side(**side) for side in preset["sides"]]
@@ -97,7 +101,11 @@ def restore(v):
 
 def gallery(v):
     names = v.js("lavender.contents.scenes.map((scene) => scene.name)")
-    made = {name for name, of in SCENES_OF_GALLERY.items() if of.__module__ == "lavender.sim.scene.gallery"}
+    made = {
+        name
+        for name, of in SCENES_OF_GALLERY.items()
+        if of.__module__ == "lavender.sim.scene.gallery"
+    }
     assert len(names) == len(made) and set(names) == made
     for name in names:
         v.page.locator("#scene").select_option(name)
@@ -148,9 +156,15 @@ def address(v):
     for to, done in (
         ("#scene=table&a=5,warm,given&b=6,warm,given&play=0", "lavender.scene.name === 'table'"),
         ("#no such scene", "lavender.scene.name === 'stack'"),
-        ("#half%", "document.querySelector('#failure').textContent.includes('half%')"),  # that encodes nothing
+        (
+            "#half%",
+            "document.querySelector('#failure').textContent.includes('half%')",
+        ),  # that encodes nothing
         ("#scene=pyramid&play=0", "lavender.scene.name === 'pyramid'"),
-        ("#scene=stack&a=1000,x,y&b=&play=0", "lavender.scene.name === 'stack'"),  # leaves what was set
+        (
+            "#scene=stack&a=1000,x,y&b=&play=0",
+            "lavender.scene.name === 'stack'",
+        ),  # leaves what was set
     ):
         v.js(f"location.hash = {to!r}")
         v.page.wait_for_function(done)
@@ -217,7 +231,10 @@ def compare_told(name, told):
     golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
     if os.environ.get("LAVENDER_TOLD") == "write":
         golden[name] = told
-        stops = {k: ",\n".join(json.dumps(x, ensure_ascii=False) for x in golden[k]) for k in sorted(golden)}
+        stops = {
+            k: ",\n".join(json.dumps(x, ensure_ascii=False) for x in golden[k])
+            for k in sorted(golden)
+        }
         GOLDEN.write_text("{" + ",\n".join(f'"{k}": [\n{x}]' for k, x in stops.items()) + "}\n")
     for stop, (now, before) in enumerate(zip_longest(told, golden[name])):
         assert now == before, (name, stop)
@@ -237,7 +254,10 @@ def test_web_tour_shows_native_numbers(visit, start):
 
 @pytest.mark.parametrize(
     ("preset", "phone"),
-    [*((preset, {}) for preset in EXPERIMENTS), (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}})],
+    [
+        *((preset, {}) for preset in EXPERIMENTS),
+        (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}}),
+    ],
 )
 def test_web_page_opened_by_the_link_of_an_experiment_shows_its_numbers(visit, preset, phone):
     v = visit("#" + preset["name"], **phone)
@@ -252,7 +272,9 @@ def test_web_page_opened_by_the_link_of_an_experiment_shows_its_numbers(visit, p
     assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
 
 
-def test_open_a_written_scene_steps_as_the_native_engine_and_its_table_is_downloaded(visit, tmp_path):
+def test_open_a_written_scene_steps_as_the_native_engine_and_its_table_is_downloaded(
+    visit, tmp_path
+):
     scene = lv.Scene("stack", n=3, friction=0.3)
     scene.add_sphere(0.2, mass=2.0, position=(0.0, 0.0, 4.0))
     write_scene(scene, tmp_path / "three.json", title="Three boxes and a ball")
@@ -352,7 +374,9 @@ def test_web_page_is_controlled_by_keyboard(visit):
     reached = set()
     for _ in range(25):
         press("Tab")
-        reached.add(v.js("(({ id, className, type }) => id || className || type)(document.activeElement)"))
+        reached.add(
+            v.js("(({ id, className, type }) => id || className || type)(document.activeElement)")
+        )
     buttons = {"play", "step", "second", "reset", "speed", "snapshot", "restore", "push"}
     assert buttons | {"order", "range"} <= reached
 
@@ -375,7 +399,9 @@ def test_web_page_runs_on_a_phone_without_network(visit):
     for name in ("#play", "#step", "#reset", "#snapshot", "#push"):
         box = v.page.locator(name).bounding_box()
         assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] >= 32
-    assert all(colors_in(v, i) > 10 for i in (0, 1))  # background, faces, edges, marks: something is drawn
+    assert all(
+        colors_in(v, i) > 10 for i in (0, 1)
+    )  # background, faces, edges, marks: something is drawn
 
 
 def test_web_page_of_a_lost_state_names_it(visit):
@@ -407,7 +433,9 @@ def test_web_page_pull_at_a_body_acts_on_both_sides(visit):
     v.page.mouse.down()
     v.page.mouse.move(x, y - 60, steps=4)
     v.js("lavender.advance(240)")
-    ends = [v.js(f"Array.from(lavender.sides[{i}].simulation.array('x').slice(6, 9))") for i in (0, 1)]
+    ends = [
+        v.js(f"Array.from(lavender.sides[{i}].simulation.array('x').slice(6, 9))") for i in (0, 1)
+    ]
     assert ends[0] == ends[1]
     assert ends[0][2] > start[2] + 0.3  # lifted off
     turn = v.js("lavender.sides[0].view.turn")
