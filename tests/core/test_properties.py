@@ -686,8 +686,10 @@ def test_solution_history_and_time_exclude_the_judge(monkeypatch):
         seen = []
         more = {
             "history": True,
-            "callback": lambda k, x, r: seen.append((k, r.relative, r.energy, r.velocity)),
-        }  # noqa: B023
+            "callback": lambda k, x, r, seen=seen: seen.append(
+                (k, r.relative, r.energy, r.velocity)
+            ),
+        }
         solution = lv.solve(problem, name, tol=1e-9, max_iter=40, **more)
         history = solution.history
         assert history.time.max() == solution.solve_time == 0.0, name
