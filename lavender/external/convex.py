@@ -16,6 +16,7 @@ judge of programs calls active as equations:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -38,7 +39,7 @@ from lavender_ext.judge.convex import (
     split_multipliers,
     split_rows,
 )
-from lavender_ext.judge.program import equilibrate_program, judge_program
+from lavender_ext.judge.program import equilibrate_program, find_components, judge_program
 
 IntArray = npt.NDArray[np.int32]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat larger numbers as infinite, or fail.
@@ -63,6 +64,16 @@ STEP_SHIFT, REFINEMENTS_OF_SHIFTED_STEP = 1e-9, 4
 MAX_SINGULAR_STEP_PIVOT = (
     1e-13  # [-] A dense matrix counts as singular below this ratio of its pivots.
 )
+
+
+# [-] Rounding of a residual relative to its terms, and the ratio of these to the right-hand side above
+# which it is not subtracted, as in the strict error of `judge_program`.
+ROW_ROUNDING, MAX_TERM_GROWTH = 2.0**-49, 1e10
+# [-] A contradiction is searched first among rows with right-hand sides up to this multiple of those of
+# violated rows, in scaled units: larger ones would hide it.
+MAX_SIDE_RATIO = 2.0**20
+# [-] Entries of x that differ from 0 or a bound by less than this share of the largest one are tried there.
+ROUNDED_SHARES = 2.0**-100, 2.0**-53, 2.0**-43, 2.0**-33
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,12 +149,89 @@ class ConvexProgram:
 
     def judge(self, x: FloatArray, lam: FloatArray) -> tuple[Any, ...]:
         """Judge x and multipliers of a program without cones: `judge_program`."""
-        return judge_program(self.P, self.q, self.J, self.t, self.scales, lam, x, self.free)
+        return judge_program(
+            self.P, self.q, self.J, self.t, self.scales, self.components, lam, x, self.free
+        )
+
+    @cached_property
+    def components(self) -> tuple[IntArray, int]:
+        """Components of the columns and rows (n + m,), and their number: `find_components`."""
+        return find_components(self.P, self.J, len(self.q), len(self.t))
 
     def clip_to_bounds(self, x: FloatArray) -> FloatArray:
         """Return x (n,) with each variable within its bounds."""
         low, high = self._bounds
         return x if low is None or high is None else np.minimum(np.maximum(x, low), high)
+
+    def list_rounded_points(self, x: FloatArray) -> Iterator[FloatArray]:
+        """Yield points with entries at 0 or at a bound that differ from these by rounding of the largest x_j / D_j.
+
+        A local error compares a variable with its own size, so that the rounding of large variables counts
+        in small ones.
+        """
+        low, high = self._bounds
+        d = self.scales[0]
+        size = d * np.abs(x / d).max(initial=0.0)
+        last = x
+        for share in ROUNDED_SHARES:
+            y = np.where(np.abs(x) <= share * size, 0.0, x)
+            if low is not None and high is not None:
+                for bound in (low, high):
+                    finite = np.isfinite(bound)
+                    reach = share * np.maximum(size, np.abs(np.where(finite, bound, 0.0)))
+                    y = np.where(finite & (np.abs(y - bound) <= reach), bound, y)
+                y = np.minimum(np.maximum(y, low), high)
+            if (y != last).any():
+                yield y
+            last = y
+
+    def find_rows_of_failing_size(self, x: FloatArray, tol: float) -> IntArray:
+        """Return the rows with right-hand sides of up to the size of the rows that x (n,) violates.
+
+        A row is violated by more than tol |t_i|; rounding of its terms is subtracted unless they are large.
+        """
+        slack = self.jacobian @ x - self.t
+        side = np.abs(self.t)
+        terms = abs(self.jacobian) @ np.abs(x) + side
+        size = np.where(
+            slack < 0.0, -slack, np.where(np.arange(len(slack)) < self.free, slack, 0.0)
+        )
+        rounding = np.where(terms > MAX_TERM_GROWTH * side, 0.0, ROW_ROUNDING * terms)
+        scaled_side = side * self.scales[1]
+        limit = scaled_side.max(initial=0.0, where=size - rounding > tol * side)
+        return np.flatnonzero(scaled_side <= MAX_SIDE_RATIO * limit).astype(np.int32)
+
+    def get_reached_side(self, x: FloatArray) -> FloatArray:
+        """Return the largest right-hand side of each row's component that x (n,) reaches (m,), in scaled units."""
+        side = np.minimum(np.abs(self.t), abs(self.jacobian) @ np.abs(x)) * self.scales[1]
+        part, count = self.components
+        largest = np.zeros(count)
+        np.maximum.at(largest, part[len(x) :], side)
+        reached: FloatArray = largest[part[len(x) :]]
+        return reached
+
+    def select_rows_and_columns(self, rows: IntArray, columns: IntArray) -> ConvexProgram:
+        """Return the program of these rows and columns (ascending) of a program without cones."""
+        place = np.full(len(self.q), -1, np.int32)
+        place[columns] = np.arange(len(columns), dtype=np.int32)
+        variable = self.variable[rows]
+        return ConvexProgram(
+            P=_get_compressed(sp.csr_matrix(self.hessian)[columns][:, columns]),
+            q=self.q[columns],
+            J=_get_compressed(self.jacobian[rows][:, columns]),
+            t=self.t[rows],
+            free=int(np.count_nonzero(rows < self.free)),
+            variable=np.where(variable >= 0, place[variable], -1).astype(np.int32),
+        )
+
+    def list_components(self) -> Iterator[tuple[IntArray, IntArray]]:
+        """Yield the rows and the columns of each component that has columns."""
+        n = len(self.q)
+        part, count = self.components
+        order = np.argsort(part, kind="stable").astype(np.int32)
+        for members in np.split(order, np.cumsum(np.bincount(part, minlength=count))[:-1]):
+            if members[0] < n:
+                yield members[members >= n] - n, members[members < n]
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray | None, FloatArray | None]:
@@ -353,6 +441,12 @@ class ScaledProgram(ConvexProgram):
         """Return (y, z, box) of multipliers (m,), with the signs of qpsolvers."""
         y, z, box = split_multipliers(self.J, self.variable, self.is_kept, self.n, self.free, lam)
         return y, z, box
+
+
+def _get_compressed(matrix: Any) -> Compressed:
+    """Return (indptr, indices, data) of a `csr_matrix`, with ascending indices of 32 bits."""
+    matrix.sort_indices()
+    return matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data
 
 
 def _factor_dense(step: Any) -> tuple[Any, int]:

@@ -228,7 +228,7 @@ def get_program(qp: QuadraticProgram) -> ConvexProgram:
         program = ConvexProgram(
             qp.hessian, qp.q, qp.jacobian, qp.target, qp.free, qp.variable, definite=definite
         )
-        program.__dict__["scales"] = qp.scales
+        program.__dict__.update(scales=qp.scales, components=qp.components)
         qp.__dict__["_convex_program"] = program
     return program
 

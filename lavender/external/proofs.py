@@ -27,6 +27,9 @@ MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 100, 1e-10, 3
 # [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
 # rounding of right-hand sides (2^10 unit roundoffs).
 PROOF_ROUNDING = 2.0**-43
+# [-] A proof among small rows is above this share of the largest right-hand side of their component that x
+# reaches, in scaled units, times the sum of |lambda| (4 unit roundoffs).
+MIN_PROOF = 2.0**-51
 NEGLIGIBLE_SHARE = (
     1e-9  # [-] Entries of a proof below this fraction of the largest one are set to 0.
 )
@@ -34,25 +37,77 @@ NEGLIGIBLE_SHARE = (
 
 @np.errstate(all="ignore")  # Proofs that overflow are not accepted.
 def find_infeasibility_proof(
-    problem: Problem, program: ConvexProgram, multipliers: FloatArray | None, deadline: Deadline
+    problem: Problem,
+    program: ConvexProgram,
+    x: FloatArray | None,
+    tol: float,
+    multipliers: FloatArray | None,
+    deadline: Deadline,
+    *,
+    only_small: bool = False,
 ) -> Proof | None:
-    """Return a proof that no x satisfies the rows, from a backend's multipliers (m,) or a linear program, or None."""
-    if not len(program.t):
+    """Return a proof that no x satisfies the rows, or None.
+
+    Rows of the size of those that fail at x are searched first, with their own scales, so that larger
+    numbers of other rows do not hide a contradiction of theirs.
+
+    Parameters
+    ----------
+    multipliers : (m,), optional
+        A backend's multipliers, which may be a proof.
+    only_small : bool
+        Whether the other rows are not searched.
+    """
+    m, n = len(program.t), len(program.q)
+    if not m:
         return None
-    rows = program.without_cost()
-    scaled = rows.scaled.without_far_rows()
-    e = rows.scales[1]
-    is_equation = np.arange(len(rows.t)) < rows.free
+    if x is not None:
+        rows = program.find_rows_of_failing_size(x, tol)
+        if 0 < len(rows) < m:
+            part = program.select_rows_and_columns(rows, np.arange(n, dtype=np.int32))
+            rounding = MIN_PROOF * (program.get_reached_side(x) / program.scales[1])[rows]
+            proof = _search_rows(problem, part, rows, None, deadline, rounding)
+            if proof is not None or only_small:
+                return proof
+    rows = np.arange(m, dtype=np.int32)
+    return _search_rows(problem, program, rows, multipliers, deadline)
+
+
+def _search_rows(
+    problem: Problem,
+    program: ConvexProgram,
+    rows: Any,
+    multipliers: FloatArray | None,
+    deadline: Deadline,
+    rounding: Any = 0.0,
+) -> Proof | None:
+    """Return a proof that no x satisfies these rows, from multipliers of them or a linear program, or None.
+
+    Parameters
+    ----------
+    program : ConvexProgram
+        The rows, without others and without a cost.
+    rows : (k,) int
+        Their numbers in the problem.
+    rounding : (k,), optional
+        Rounding of their right-hand sides, which counts against a proof.
+    """
+    program = program.without_cost()
+    scaled, e = program.scaled.without_far_rows(), program.scales[1]
+    is_equation = np.arange(len(program.t)) < program.free
     candidates = [] if multipliers is None else [multipliers]
     for attempt in range(2):
         for lam in candidates:
             y = _remove_small_entries(np.where(is_equation, lam, np.maximum(lam, 0.0)) / e) * e
             scaled_y = y / e
-            if not rows.scaled.t @ scaled_y > PROOF_ROUNDING * np.abs(scaled_y).sum():
+            if not program.scaled.t @ scaled_y > PROOF_ROUNDING * np.abs(scaled_y).sum():
+                continue
+            if not program.t @ y > np.sum(rounding * np.abs(y)):
                 continue
             if deadline.has_passed():
                 return None
-            direction = np.concatenate([np.zeros(problem.m - len(y)), y])
+            direction = np.zeros(problem.m)
+            direction[problem.m - len(problem.qp.target) + rows] = y
             proof = prove_infeasibility(problem, direction, 0.0, deadline)
             if not proof.reason:
                 return proof

@@ -21,7 +21,7 @@ from lavender.external.isolated import run_isolated, start_process
 from lavender.external.running import BackendResult, call_backend_until_accepted
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import judge_impulse
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.program import QuadraticProgram
 from lavender.solvers.registry import Solver
@@ -59,13 +59,14 @@ class ProgramJudge:
     ----------
     x, lam : (n,), (m,)
         The best point, with complementary multipliers; None without a point.
-    error, strict_error : float
-        Its errors; the strict one compares rows and columns with their right-hand side and q alone.
+    error, strict_error, hidden_error : float
+        Its errors by `judge_program`; the strict one compares rows and columns with their right-hand
+        side and q alone, the hidden one is that of rows with a right-hand side that is rounding.
     """
 
     def __init__(self, program: ConvexProgram, tol: float, deadline: Deadline) -> None:
         self.program, self.tol, self.deadline = program, tol, deadline
-        self.error = self.strict_error = np.inf
+        self.error = self.strict_error = self.hidden_error = np.inf
         self.x: FloatArray | None = None
         self.lam: FloatArray | None = None
         self.has_step = False
@@ -134,10 +135,16 @@ class ProgramJudge:
     ) -> tuple[float, Any, FloatArray]:
         """Judge a point, clipped to the bounds of the variables, and store it if it is the best."""
         x = self.program.clip_to_bounds(x)
-        error, strict_error, _, _, active, complementary = self.program.judge(x, lam)
+        error, strict_error, _, _, active, complementary, hidden = self.program.judge(x, lam)
+        if error > self.tol and np.isfinite(x).all():
+            for near in self.program.list_rounded_points(x):
+                judged = self.program.judge(near, lam)
+                if judged[0] < error:
+                    x = near
+                    error, strict_error, _, _, active, complementary, hidden = judged
         if error < self.error or self.x is None:
             self.x, self.lam, self.has_step = x, complementary, has_step
-            self.error, self.strict_error = error, strict_error
+            self.error, self.strict_error, self.hidden_error = error, strict_error, hidden
         return error, active, complementary
 
 
@@ -167,7 +174,7 @@ class ContactJudge:
         self._keep(x, lam)
         program = self.form.program
         if self.above > self.tol and not program.cones:
-            _, _, _, _, active, complementary = program.judge(x, lam)
+            active, complementary = program.judge(x, lam)[4:6]
             point = program.polish(x, complementary, active, MAX_STEP_SIZE)
             if point is not None:
                 self._keep(*point)
@@ -246,7 +253,38 @@ class QPSolver(Solver):
         judge = ProgramJudge(program, tol, deadline)
         # Without a limit of the user, a second call has as many iterations as the first one.
         budget = 2 * self.backend.max_iter if max_iter is None else max_iter
-        return judge, self._call(program, judge, budget, tol, deadline, start)
+        result = self._call(program, judge, budget, tol, deadline, start)
+        if result.status is not Status.INFEASIBLE:
+            self._solve_components(program, judge, result, budget, tol, deadline)
+        return judge, result
+
+    def _solve_components(
+        self,
+        program: ConvexProgram,
+        judge: ProgramJudge,
+        result: BackendResult,
+        max_iter: int,
+        tol: float,
+        deadline: Deadline,
+    ) -> None:
+        """Solve the components of a program that miss tol alone, with their own sizes, and add their work."""
+        if not judge.error > tol or judge.x is None or judge.lam is None:
+            return
+        if program.components[1] == 1:
+            return
+        x, lam = judge.x.copy(), judge.lam.copy()
+        for rows, columns in program.list_components():
+            if deadline.has_passed() or result.iterations >= max_iter:
+                break
+            part = program.select_rows_and_columns(rows, columns)
+            own = ProgramJudge(part, tol, deadline)
+            if own.keep(x[columns], lam[rows])[0] <= tol or len(columns) == len(x):
+                continue
+            answer = self._call(part, own, max_iter - result.iterations, tol, deadline, None)
+            result.work = sum_work_counts((result.work, answer.work))
+            if own.x is not None:
+                x[columns], lam[rows] = own.x, own.lam
+        judge.keep(x, lam, True)
 
     def _call(
         self,

@@ -58,7 +58,7 @@ from lavender.problem.generalized import (
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle
 from lavender_ext.judge.convex import split_multipliers, stack_program
 from lavender_ext.judge.measure import all_finite
-from lavender_ext.judge.program import equilibrate_program, judge_program
+from lavender_ext.judge.program import equilibrate_program, find_components, judge_program
 
 IntArray = npt.NDArray[np.int32]
 IntpArray = npt.NDArray[np.intp]
@@ -173,16 +173,17 @@ class QPSolution:
     def error(self) -> float:
         """Error of x and the multipliers, relative to the terms of the program's rows and columns; 0 if exact.
 
-        It is the largest of three numbers, for all constraints as rows J x = t or J x >= t with multipliers lambda:
+        It is the largest of three numbers, for all constraints as rows J x = t or J x >= t with multipliers lambda,
+        and components of rows and columns that entries of P and J connect:
 
         - Row i, if it is an equation, active or violated: |J x - t|_i / (|J| |x| + |t|)_i.
         - Column j: |P x + q - J^T lambda|_j / (|P| |x| + |q|)_j.
-        - Gap: the sum of |lambda_i (J x - t)_i| and |x_j (P x + q - J^T lambda)_j|, divided by
+        - Gap of a component: the sum of |lambda_i (J x - t)_i| and |x_j (P x + q - J^T lambda)_j|, divided by
           |x|.|P| |x| + |q|.|x|.
 
         An inequality is active if its multiplier, relative to its columns, exceeds its slack, relative to its row;
-        otherwise its multiplier counts as 0. Rounding errors of the sums count as 0, and no divisor is a rounding
-        error: `lavender_ext/judge/program.pyx` has the formulas.
+        otherwise its multiplier counts as 0. Rounding of the own terms of a row or column counts as 0, and no divisor
+        depends on another component: `lavender_ext/judge/program.pyx` has the formulas.
         """
         return float(self._judged[0])
 
@@ -290,8 +291,21 @@ class QuadraticProgram:
     def judge(self, x: FloatArray, multipliers: FloatArray) -> tuple[Any, ...]:
         """Judge x (n,) and the multipliers (m,) of the rows: `judge_program`."""
         return judge_program(
-            self.hessian, self.q, self.jacobian, self.target, self.scales, multipliers, x, self.free
+            self.hessian,
+            self.q,
+            self.jacobian,
+            self.target,
+            self.scales,
+            self.components,
+            multipliers,
+            x,
+            self.free,
         )
+
+    @cached_property
+    def components(self) -> tuple[IntArray, int]:
+        """Components of the columns and rows (n + m,), and their number: `find_components`."""
+        return find_components(self.hessian, self.jacobian, len(self.q), len(self.target))
 
     @cached_property
     def scales(self) -> tuple[FloatArray, FloatArray, float, float]:

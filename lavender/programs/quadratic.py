@@ -233,12 +233,20 @@ class _Task:
         # point that was found in `max_iter` iterations.
         has_budget = self.max_iter is None or self.judge.error <= self.judge.tol
         has_budget = has_budget and not self.deadline.has_passed() and len(self.qp.q) > 0
-        if not self.judge.strict_error <= self.judge.tol and not is_stopped and has_budget:
+        is_strict = self.judge.strict_error <= self.judge.tol
+        has_doubts = not (is_strict and self.judge.hidden_error <= self.judge.tol)
+        if has_doubts and not is_stopped and has_budget:
             # Search for a proof that no x satisfies the rows and, if no point is found, for a ray.
             self.proof = self.proof or find_infeasibility_proof(
-                self.problem, self.program, self.rays[-1] if self.rays else None, self.deadline
+                self.problem,
+                self.program,
+                self.judge.x,
+                self.judge.tol,
+                self.rays[-1] if self.rays else None,
+                self.deadline,
+                only_small=is_strict,
             )
-            if self.proof is None and self.qp.is_singular:
+            if self.proof is None and self.qp.is_singular and not is_strict:
                 found = find_ray(self.program, self.judge.x, self.deadline)
                 if found is not None:
                     self.ray = mark_read_only(found[0])

@@ -2,23 +2,44 @@
 
     min 1/2 x.P x + q.x   subject to   (J x)_i = t_i for i < free,   (J x)_i >= t_i for the other rows
 
-with multipliers lambda, P x + q = J^T lambda. P (both triangles) and J are compressed rows. |.| of a sum is the sum of the
-absolute terms, u = 2^-53. The error is the largest of
+with multipliers lambda, P x + q = J^T lambda. P (both triangles) and J are compressed rows. A
+component is a set of rows and columns that entries of P and J connect. u = 2^-53, and
 
-    row i       |J x - t|_i / (|J| |x| + |t|)_i                                                  (Oettli, Prager 1964)     (1)
-    column j    |P x + q - J^T lambda|_j / (|P| |x| + |q|)_j,   plus (|J|^T |lambda|)_j if that is rounding                (2)
-    gap         (sum |lambda_i (J x - t)_i| + sum |x_j (P x + q - J^T lambda)_j|) / (|x|.|P| |x| + |q|.|x|)                (3)
+    own_i = (|J| |x| + |t|)_i,   cost_j = (|P| |x| + |q|)_j,   full_j = cost_j + (|J|^T |lambda|)_j
 
-over equations, active inequalities and violated rows. An inequality is active if the share of its multiplier in its
-columns, max_j |J_ij lambda_i| / c_j, exceeds the share of its slack in its row; otherwise, and if lambda_i < 0, lambda_i is
-set to 0 (4). A divisor below NOISE of its norm-wise value is rounding and takes that value, and ROUNDING of it are
-subtracted from the residuals of rows and columns (Arioli, Demmel, Duff 1989) (5). With x = sigma D x', rows multiplied by E:
+are sums of absolute terms. Sums are compensated (Neumaier 1974), so that 16 u of its terms is the
+rounding of a residual whatever the number of terms (Skeel 1979):
 
-    X = max(sigma, max |x_j| / D_j),   norm_i = max_j (|J_ij| D_j) X + |t_i|,   cost_j = max_k (|P_jk| D_k) X + |q_j|
-    Y = max(max |lambda_i| / E_i, max_j D_j cost_j),            norm_j = cost_j + max_i (E_i |J_ij|) Y
+    excess_i = max(|J x - t|_i - 16 u own_i, 0),   rest_j = max(|P x + q - J^T lambda|_j - 16 u full_j, 0)
 
-The strict error compares rows with |t_i| and columns with |q_j| alone, unless these are rounding; such a row is compared
-with norm_i for X = sigma, so that large x do not hide rows that contradict each other.
+The error of a component is the largest of
+
+    row i       excess_i / own_i                                     (Oettli, Prager 1964)          (1)
+    column j    rest_j / max(c_j, 2^10 u full_j),   c_j = cost_j, or if that is 0 the smaller one
+                of full_j and top / D_j                                                             (2)
+    gap         (sum |lambda_i| excess_i + sum |x_j| rest_j) / sum |x_j| cost_j                     (3)
+
+over equations, active inequalities and violated rows; top = max_j D_j cost_j over the component. An
+inequality is active if the share of its multiplier in its columns, max_j |J_ij lambda_i| / divisor_j,
+exceeds (1); otherwise, and if lambda_i < 0, lambda_i is set to 0 (4). Multipliers are a proof, which
+the judge may choose: lambda_i below one of `THRESHOLDS` of the largest of its component, in scaled
+units, is 0 if that makes the error of the component smaller (5).
+
+A row of two or more entries whose terms are all rounding of a right-hand side of its component holds:
+(1) is multiplied by
+
+    ramp(own_i E_i / (2^7 u max_k min(|t_k|, (|J||x|)_k) E_k)),   ramp(s) = min(max(s - 1, 0), 1)   (6)
+
+(after Arioli, Demmel, Duff 1989). The row still counts in (3).
+
+Multipliers whose rounding is as large as all costs of their component prove nothing: (2) is at least
+
+    ramp(128 u D_j full_j / top) |P x + q - J^T lambda|_j / (cost_j, or if that is 0 top / D_j)     (7)
+
+The strict error compares rows with |t_i| and columns with |q_j| alone, so that large x does not hide
+rows that contradict each other, nor a ray. Where these are 0, the terms for |x| up to the largest
+right-hand side that x = 0 violates take their place. Rounding is not subtracted from residuals with
+terms beyond 1e10 of these.
 """
 from libc.math cimport INFINITY, exp2, fabs, isfinite, round, sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -30,15 +51,24 @@ from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer
 from lavender_ext.core.problem cimport Workspace, allocate_bytes
 
 cdef double UNIT = 2.0**-53
-cdef double NOISE = 1024.0 * UNIT
-cdef double ROUNDING = 16.0 * UNIT
+cdef double NOISE = 1024.0 * UNIT           # Costs below this share of full_j are rounding (2).
+cdef double ROUNDING = 16.0 * UNIT          # Share of its terms that counts as rounding of a residual.
+cdef double SIDE_ROUNDING = 128.0 * UNIT    # Rounding of right-hand sides (6).
+# A proof of infeasibility is above this multiple of the largest right-hand side that x reaches.
+cdef double MIN_PROOF = 4.0 * UNIT
+cdef double EXACT = 1e-12                   # Multipliers of components with larger errors are chosen (5).
+cdef enum:
+    N_THRESHOLDS = 6
+cdef double[N_THRESHOLDS] THRESHOLDS = [2.0**-53, 2.0**-48, 2.0**-43, 2.0**-33, 2.0**-23, 1.0]
+cdef double MAX_SIZE_GROWTH = 1e10          # Largest growth of terms whose rounding the strict error accepts.
 cdef int EQUILIBRATION_STEPS = 8
-cdef double EQUILIBRATION_TOLERANCE = 1e-4  # Squared residual of (6) at which its steps end, relative to the first one.
-cdef double NEGLIGIBLE_ENTRY = 1e-13        # Entries below this share of their row have no part in (6).
+# Squared residual of (8) at which its steps end, relative to the first one.
+cdef double EQUILIBRATION_TOLERANCE = 1e-4
+cdef double NEGLIGIBLE_ENTRY = 1e-13        # Entries below this share of their row have no part in (8).
 cdef double NEGLIGIBLE_SIDE = 1e-14         # Right-hand sides below this share of the others are rounding.
 cdef double PLACEHOLDER = 1e18              # Larger numbers have no part in the size of the variables.
-cdef double MAX_SIZE_GROWTH = 1e10          # Largest ratio of x to sigma whose rounding the strict error accepts.
-cdef double MAX_SIZE_RATIO = 1e6            # Largest ratio of the size of the variables to the smallest right-hand side.
+# Largest ratio of the size of the variables to the smallest right-hand side.
+cdef double MAX_SIZE_RATIO = 1e6
 
 
 cdef csr_t read_csr(object arrays, Py_ssize_t m, Py_ssize_t n) except *:
@@ -56,47 +86,225 @@ cdef inline double ratio_or_inf(double x, double scale) noexcept nogil:
     return x / scale if scale > 0.0 else INFINITY if x > 0.0 else 0.0
 
 
-cdef inline double above_noise(double value, double norm) noexcept nogil:
-    """Return a divisor, or its norm-wise value if the divisor is rounding (5)."""
-    return value if value > NOISE * norm else norm
+cdef inline double ramp(double s) noexcept nogil:
+    """Return s - 1 within 0 and 1."""
+    return min(max(s - 1.0, 0.0), 1.0)
 
 
-cdef struct columns_t:
-    # Terms of the columns of a point.
-    const double* cost          # (n) (|P| |x| + |q|)_j
-    const double* cost_norm     # (n) cost_j of (5)
-    const double* force_norm    # (n) max_i E_i |J_ij|
+cdef inline void add_compensated(double* total, double* lost, double v) noexcept nogil:
+    """Add v to a sum, and the rounding of the addition to `lost` (Knuth's two-sum)."""
+    cdef double s = total[0] + v
+    cdef double part = s - total[0]
+    lost[0] += (total[0] - (s - part)) + (v - part)
+    total[0] = s
+
+
+# -- components --------------------------------------------------------------------------------------
+
+cdef inline int32_t find_root(int32_t* parent, int32_t i) noexcept nogil:
+    """Return the root of i in a forest, and halve the path to it."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+cdef void unite(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
+    """Unite the trees of i and j; the smaller root remains one."""
+    i, j = find_root(parent, i), find_root(parent, j)
+    parent[max(i, j)] = min(i, j)
+
+
+def find_components(hessian, jac, Py_ssize_t n, Py_ssize_t m):
+    """Return the component of each column and of each row, (n + m,) int32, and the number of components.
+
+    Components are numbered by their first columns; a row without nonzero entries is a component.
+    """
+    cdef Py_ssize_t i, k
+    cdef int32_t count = 0
+    cdef csr_t p = read_csr(hessian, n, n)
+    cdef csr_t a = read_csr(jac, m, n)
+    of_ = np.arange(n + m, dtype=np.int32)
+    cdef int32_t* of = as_int_pointer(of_, n + m)
+    for i in range(n):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if p.val[k] != 0.0:
+                unite(of, <int32_t>i, p.idx[k])
+    for i in range(m):
+        for k in range(a.ptr[i], a.ptr[i + 1]):
+            if a.val[k] != 0.0:
+                unite(of, <int32_t>(n + i), a.idx[k])
+    number_ = np.empty(n + m, np.int32)
+    cdef int32_t* number = as_int_pointer(number_, n + m)
+    for i in range(n + m):                              # Roots have smaller indices than their trees.
+        of[i] = of[of[i]]
+        if of[i] == i:
+            number[i], count = count, count + 1
+        else:
+            number[i] = number[of[i]]
+    return number_, count
+
+
+# -- errors ------------------------------------------------------------------------------------------
+
+cdef struct point_t:
+    # Terms of a point x, which the choice of multipliers does not change, and of its multipliers.
+    csr_t a
+    int32_t free
+    const int32_t* column_part  # (n) component
+    const int32_t* row_part     # (m) component
+    Py_ssize_t parts            # number of components
+    const double* d             # (n)
+    const double* e             # (m)
+    const double* x             # (n)
+    double* gradient            # (n) (P x + q)_j
+    double* gradient_lost       # (n) its rounding
+    double* cost                # (n) cost_j
+    double* reach               # (n) divisor of the strict error, 0 without one
     double* force               # (n) (J^T lambda)_j
+    double* force_lost          # (n) its rounding
+    double* full                # (n) full_j
     double* divisor             # (n) divisor of (2)
-    double* norm                # (n) norm_j of (5)
+    double* slack               # (m) (J x - t)_i
+    double* own                 # (m) own_i
+    double* excess              # (m) excess_i
+    double* weight              # (m) factor (6)
+    double* top                 # (parts) top of (2)
+    double* value               # (parts) sum |x_j| cost_j
+    double* gap                 # (parts) numerator of (3)
+    unsigned char* active       # (m)
 
 
-cdef void compute_columns(const csr_t* a, const double* lam, const double* e, double top_cost, columns_t* c) noexcept nogil:
-    """Compute forces, divisors and norm-wise values of the columns for the multipliers lambda."""
+cdef struct errors_t:
+    double row, column, total
+
+
+cdef void compute_columns(point_t* p, const double* lam) noexcept nogil:
+    """Compute forces, their terms and the divisors of (2) for the multipliers lambda."""
     cdef Py_ssize_t i, j, k
-    cdef double top = top_cost, v
-    for j in range(a.n):
-        c.force[j], c.divisor[j] = 0.0, c.cost[j]       # The divisor holds |P||x| + |q| + |J|^T |lambda| at first.
-    for i in range(a.m):
+    cdef double v, c
+    for j in range(p.a.n):
+        p.force[j], p.force_lost[j], p.full[j] = 0.0, 0.0, p.cost[j]
+    for i in range(p.a.m):
         if lam[i] == 0.0:
             continue
-        top = max(top, fabs(lam[i]) / e[i])
-        for k in range(a.ptr[i], a.ptr[i + 1]):
-            v = a.val[k] * lam[i]
-            c.force[a.idx[k]] += v
-            c.divisor[a.idx[k]] += fabs(v)
-    for j in range(a.n):
-        c.norm[j] = c.cost_norm[j] + c.force_norm[j] * top
-        if c.cost[j] > NOISE * c.norm[j]:
-            c.divisor[j] = c.cost[j]
-        else:
-            c.divisor[j] = above_noise(c.divisor[j], c.norm[j])
+        for k in range(p.a.ptr[i], p.a.ptr[i + 1]):
+            v = p.a.val[k] * lam[i]
+            add_compensated(&p.force[p.a.idx[k]], &p.force_lost[p.a.idx[k]], v)
+            p.full[p.a.idx[k]] += fabs(v)
+    for j in range(p.a.n):
+        c = p.cost[j]
+        if c == 0.0:
+            v = p.top[p.column_part[j]] / p.d[j]
+            c = min(p.full[j], v) if v > 0.0 else p.full[j]
+        p.divisor[j] = max(c, NOISE * p.full[j])
 
 
-def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
+cdef errors_t judge_multipliers(point_t* p, double* lam, double* part_error) noexcept nogil:
+    """Set multipliers to 0 by (4), and compute the errors of all rows, columns and components.
+
+    `part_error` (parts) receives the error of each component.
+    """
+    cdef Py_ssize_t i, j, k, c
+    cdef double v, share, rest
+    cdef bint is_changed = False
+    cdef errors_t out = errors_t(0.0, 0.0, 0.0)
+    compute_columns(p, lam)
+    for i in range(p.a.m):
+        p.active[i] = i < p.free
+        if i >= p.free and lam[i] != 0.0:
+            share = 0.0
+            for k in range(p.a.ptr[i], p.a.ptr[i + 1]):
+                share = max(share, ratio_or_inf(fabs(p.a.val[k] * lam[i]), p.divisor[p.a.idx[k]]))
+            p.active[i] = share > p.weight[i] * ratio_or_inf(p.excess[i], p.own[i])
+            if not p.active[i]:
+                lam[i], is_changed = 0.0, True
+    if is_changed:
+        compute_columns(p, lam)
+    for c in range(p.parts):
+        p.gap[c] = part_error[c] = 0.0
+    for i in range(p.a.m):
+        if p.active[i] or p.slack[i] < 0.0:
+            c = p.row_part[i]
+            p.gap[c] += fabs(lam[i]) * p.excess[i]
+            v = p.weight[i] * ratio_or_inf(p.excess[i], p.own[i])
+            part_error[c], out.row = max(part_error[c], v), max(out.row, v)
+    for j in range(p.a.n):
+        c = p.column_part[j]
+        v = fabs((p.gradient[j] - p.force[j]) + (p.gradient_lost[j] - p.force_lost[j]))
+        rest = max(v - ROUNDING * p.full[j], 0.0)
+        p.gap[c] += fabs(p.x[j]) * rest
+        rest = ratio_or_inf(rest, p.divisor[j])
+        share = 8.0 * ROUNDING * p.d[j] * p.full[j]
+        if share > p.top[c] > 0.0:
+            share = ramp(share / p.top[c])
+            rest = max(rest, share * v / (p.cost[j] if p.cost[j] > 0.0 else p.top[c] / p.d[j]))
+        if not isfinite(v):
+            rest = INFINITY
+        part_error[c], out.column = max(part_error[c], rest), max(out.column, rest)
+    for c in range(p.parts):
+        v = ratio_or_inf(p.gap[c], p.value[c])
+        part_error[c] = max(part_error[c], v) if isfinite(p.gap[c]) else INFINITY
+        out.total = max(out.total, part_error[c])
+    return out
+
+
+cdef errors_t choose_multipliers(point_t* p, double* lam, const double* given, errors_t best, double* part_error,
+                                 double* work) noexcept nogil:
+    """Replace multipliers by (5) if that makes the error smaller; return the errors.
+
+    Parameters
+    ----------
+    lam : (m), changed
+        Multipliers that were judged, with their errors `best` and those of the components, `part_error` (parts).
+    given : (m)
+        The same before (4).
+    work : (2 m + 3 parts), scratch
+    """
+    cdef Py_ssize_t i, c, step, m = p.a.m
+    cdef bint is_changed, is_better = False
+    cdef errors_t errors
+    cdef double* trial = work
+    cdef double* choice = trial + m
+    cdef double* trial_error = choice + m
+    cdef double* largest = trial_error + p.parts        # Largest multiplier or cost, in scaled units.
+    cdef double* gain = largest + p.parts
+    memcpy(largest, p.top, p.parts * sizeof(double))
+    memcpy(choice, lam, m * sizeof(double))
+    for i in range(m):
+        largest[p.row_part[i]] = max(largest[p.row_part[i]], fabs(given[i]) / p.e[i])
+    for step in range(N_THRESHOLDS):
+        is_changed = False
+        for i in range(m):
+            c, trial[i] = p.row_part[i], given[i]
+            if given[i] != 0.0 and part_error[c] > EXACT and (
+                    fabs(given[i]) / p.e[i] <= THRESHOLDS[step] * largest[c]):
+                trial[i], is_changed = 0.0, True
+        if not is_changed:
+            continue
+        judge_multipliers(p, trial, trial_error)
+        is_changed = False
+        for c in range(p.parts):
+            gain[c] = part_error[c] - trial_error[c] if trial_error[c] < part_error[c] else 0.0
+            if gain[c] > 0.0:
+                part_error[c], is_changed = trial_error[c], True
+        if is_changed:
+            is_better = True
+            for i in range(m):
+                if gain[p.row_part[i]] > 0.0:
+                    choice[i] = trial[i]
+    if is_better:
+        errors = judge_multipliers(p, choice, trial_error)
+        if errors.total < best.total:
+            memcpy(lam, choice, m * sizeof(double))
+            return errors
+    return judge_multipliers(p, lam, trial_error)       # It restores forces and active rows.
+
+
+def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
     """Judge x (n,) and lambda (m,) of a program by the formulas of the module.
 
-    `scales` is the result of `equilibrate_program`.
+    `scales` is the result of `equilibrate_program`, `parts_` that of `find_components`.
 
     Returns
     -------
@@ -108,95 +316,121 @@ def judge_program(hessian, q_, jac, t_, scales, lam_, x_, int32_t free):
         Equations, and inequalities that are active.
     lam : (m,)
         Complementary multipliers.
+    hidden_error : float
+        The strict error of rows with a right-hand side that counts as rounding, relative to it.
     """
-    cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
+    cdef Py_ssize_t i, j, k, c, n = len(x_), m = len(lam_), parts = parts_[1], count
     cdef const double* x = as_double_pointer(x_, n)
     cdef const double* q = as_double_pointer(q_, n)
     cdef const double* t = as_double_pointer(t_, m)
-    cdef const double* d = as_double_pointer(scales[0], n)
-    cdef const double* e = as_double_pointer(scales[1], m)
+    cdef csr_t a
     cdef csr_t p = read_csr(hessian, n, n)
-    cdef csr_t a = read_csr(jac, m, n)
     complementary = np.array(lam_)
     active_ = np.zeros(m, bool)
     cdef double* lam = as_double_pointer(complementary, m)
-    cdef unsigned char[::1] active = active_.view(np.uint8)
-    cdef Workspace workspace = allocate_bytes((7 * n + 4 * m + 1) * sizeof(double))
-    cdef double* px = <double*>workspace.at             # (n) P x + q
-    cdef double* cost = px + n
-    cdef double* cost_norm = cost + n
-    cdef double* force_norm = cost_norm + n
-    cdef double* force = force_norm + n
-    cdef double* divisor = force + n
-    cdef double* norm = divisor + n
-    cdef double* slack = norm + n                       # (m) J x - t
-    cdef double* row = slack + m                        # (m) divisor of (1)
-    cdef double* row_norm = row + m                     # (m) norm_i
-    cdef double* start_norm = row_norm + m              # (m) norm_i for X = sigma
-    cdef columns_t columns = columns_t(cost, cost_norm, force_norm, force, divisor, norm)
-    cdef double v, w, share, excess
-    cdef double top = scales[2], top_cost = 0.0, top_term = 0.0, terms = 0.0, gap = 0.0
-    cdef double row_error = 0.0, column_error = 0.0, strict = 0.0
-    cdef bint has_cost = False
+    cdef const unsigned char[::1] active = active_.view(np.uint8)
+    cdef Workspace workspace = allocate_bytes((8 * n + 8 * m + 9 * parts + 1) * sizeof(double))
+    cdef double* numbers = <double*>workspace.at
+    cdef point_t at
+    at.a, at.free, at.parts = read_csr(jac, m, n), free, parts
+    at.column_part = as_int_pointer(parts_[0], n + m)
+    at.row_part = at.column_part + n
+    at.d, at.e, at.x = as_double_pointer(scales[0], n), as_double_pointer(scales[1], m), x
+    at.gradient, at.gradient_lost, at.cost, at.reach = numbers, numbers + n, numbers + 2 * n, numbers + 3 * n
+    numbers += 4 * n
+    at.force, at.force_lost, at.full, at.divisor = numbers, numbers + n, numbers + 2 * n, numbers + 3 * n
+    numbers += 4 * n
+    at.slack, at.own, at.excess, at.weight = numbers, numbers + m, numbers + 2 * m, numbers + 3 * m
+    numbers += 4 * m
+    cdef double* given = numbers                        # (m) multipliers before (4)
+    cdef double* reach = numbers + m                    # (m) divisor of the strict error
+    numbers += 2 * m
+    at.top, at.value, at.gap = numbers, numbers + parts, numbers + 2 * parts
+    cdef double* part_error = numbers + 3 * parts
+    cdef double* size = numbers + 4 * parts             # Largest right-hand side that x = 0 violates.
+    cdef double* side = numbers + 5 * parts             # Largest right-hand side that x reaches.
+    cdef double* work = numbers + 6 * parts
+    at.active = <unsigned char*>&active[0] if m else NULL
+    cdef double v, w, lost, strict = 0.0, hidden = 0.0, necessary = 0.0, terms = 0.0
+    cdef errors_t errors
+    a = at.a
     for j in range(n):
         if not isfinite(x[j]):
-            return INFINITY, INFINITY, INFINITY, INFINITY, active_, complementary
-        top = max(top, fabs(x[j]) / d[j])
-    # Columns: gradient of the cost with its terms.
+            return INFINITY, INFINITY, INFINITY, INFINITY, active_, complementary, INFINITY
+    memset(at.top, 0, 6 * parts * sizeof(double))
+    for i in range(m):
+        c = at.row_part[i]
+        if i < free or t[i] > 0.0:
+            size[c] = max(size[c], fabs(t[i]) * at.e[i])
+    # Columns: gradient of the cost with its terms. `gap` holds whether a component has a cost.
     for j in range(n):
-        px[j], cost[j], w, force_norm[j] = q[j], fabs(q[j]), 0.0, 0.0
+        c = at.column_part[j]
+        v, lost, at.cost[j], at.reach[j] = q[j], 0.0, fabs(q[j]), fabs(q[j])
         for k in range(p.ptr[j], p.ptr[j + 1]):
-            v = p.val[k] * x[p.idx[k]]
-            px[j] += v
-            cost[j] += fabs(v)
-            w = max(w, fabs(p.val[k]) * d[p.idx[k]])
-        has_cost |= w > 0.0 or q[j] != 0.0
-        cost_norm[j] = w * top + fabs(q[j])
-        top_cost = max(top_cost, d[j] * cost_norm[j])
-        top_term = max(top_term, d[j] * max(w * top, fabs(q[j])))
-        terms += fabs(x[j]) * cost[j]
+            w = p.val[k] * x[p.idx[k]]
+            add_compensated(&v, &lost, w)
+            at.cost[j] += fabs(w)
+            if q[j] == 0.0:
+                w = fabs(p.val[k]) * min(fabs(x[p.idx[k]]), at.d[p.idx[k]] * size[c])
+                at.reach[j] += w
+            if p.val[k] != 0.0:
+                at.gap[c] = 1.0
+        at.gradient[j], at.gradient_lost[j] = v, lost
+        if q[j] != 0.0:
+            at.gap[c] = 1.0
+        at.top[c] = max(at.top[c], at.d[j] * at.cost[j])
+        at.value[c] += fabs(x[j]) * at.cost[j]
+        terms += at.cost[j] + fabs(x[j]) * at.cost[j]
     # Rows: slacks with their terms.
     for i in range(m):
-        slack[i], row[i], w = -t[i], fabs(t[i]), 0.0
+        c = at.row_part[i]
+        v, lost, at.own[i], reach[i] = -t[i], 0.0, 0.0, 0.0
         for k in range(a.ptr[i], a.ptr[i + 1]):
             j = a.idx[k]
-            v = a.val[k] * x[j]
-            slack[i] += v
-            row[i] += fabs(v)
-            w = max(w, fabs(a.val[k]) * d[j])
-            force_norm[j] = max(force_norm[j], fabs(a.val[k]) * e[i])
-        row_norm[i] = w * top + fabs(t[i])
-        start_norm[i] = w * <double>scales[2] + fabs(t[i])
-        row[i] = above_noise(row[i], row_norm[i])
-        if not isfinite(lam[i]) or (i >= free and lam[i] < 0.0) or not has_cost:
+            w = a.val[k] * x[j]
+            add_compensated(&v, &lost, w)
+            at.own[i] += fabs(w)
+            reach[i] += fabs(a.val[k]) * min(fabs(x[j]), at.d[j] * size[c])
+        side[c] = max(side[c], min(fabs(t[i]), at.own[i]) * at.e[i])
+        at.own[i] += fabs(t[i])
+        at.slack[i] = v + lost
+        at.excess[i] = max(fabs(at.slack[i]) - ROUNDING * at.own[i], 0.0)
+        terms += at.own[i]
+        if not isfinite(lam[i]) or (i >= free and lam[i] < 0.0) or at.gap[c] == 0.0:
             lam[i] = 0.0
-    # Complementarity (4).
-    compute_columns(&a, lam, e, top_cost, &columns)
+        given[i] = lam[i]
     for i in range(m):
-        share = 0.0
+        c, count = at.row_part[i], 0
+        v = SIDE_ROUNDING * side[c]                     # Rounding of right-hand sides, in scaled units.
+        if fabs(t[i]) * at.e[i] > v:
+            reach[i] = fabs(t[i])
+        elif size[c] == 0.0:
+            reach[i] = at.own[i]
         for k in range(a.ptr[i], a.ptr[i + 1]):
-            share = max(share, ratio_or_inf(fabs(a.val[k] * lam[i]), divisor[a.idx[k]]))
-        active[i] = i < free or share > max(fabs(slack[i]) - ROUNDING * row_norm[i], 0.0) / row[i]
-        if not active[i]:
-            lam[i] = 0.0
-    compute_columns(&a, lam, e, top_cost, &columns)
-    # Errors of rows (1), columns (2) and their sum (3).
+            count += a.val[k] != 0.0
+        at.weight[i] = ramp(at.own[i] * at.e[i] / v) if count > 1 and v > 0.0 else 1.0
+        if i < free or at.slack[i] < 0.0:
+            necessary = max(necessary, at.weight[i] * ratio_or_inf(at.excess[i], at.own[i]))
+    errors = judge_multipliers(&at, lam, part_error)
+    if errors.total > max(EXACT, necessary):
+        errors = choose_multipliers(&at, lam, given, errors, part_error, work)
+    # Strict and hidden errors.
     for i in range(m):
-        if active[i] or slack[i] < 0.0:
-            excess = max(fabs(slack[i]) - ROUNDING * row_norm[i], 0.0)
-            gap += fabs(lam[i]) * excess
-            row_error = max(row_error, ratio_or_inf(excess, row[i]))
-            excess = max(fabs(slack[i]) - ROUNDING * min(row_norm[i], MAX_SIZE_GROWTH * start_norm[i]), 0.0)
-            strict = max(strict, ratio_or_inf(excess, fabs(t[i]) if fabs(t[i]) > NOISE * row_norm[i] else start_norm[i]))
+        if at.active[i] or at.slack[i] < 0.0:
+            v = fabs(at.slack[i]) if at.own[i] > MAX_SIZE_GROWTH * reach[i] else at.excess[i]
+            strict = max(strict, at.weight[i] * ratio_or_inf(v, reach[i]))
+            # Right-hand sides below MIN_PROOF are rounding in every proof.
+            if reach[i] != fabs(t[i]) and fabs(t[i]) * at.e[i] > MIN_PROOF * side[at.row_part[i]]:
+                v = fabs(at.slack[i]) if at.own[i] > MAX_SIZE_GROWTH * fabs(t[i]) else at.excess[i]
+                hidden = max(hidden, v / fabs(t[i]))
     for j in range(n):
-        excess = max(fabs(px[j] - force[j]) - ROUNDING * norm[j], 0.0)
-        gap += fabs(x[j]) * excess
-        column_error = max(column_error, ratio_or_inf(excess, divisor[j]))
-        strict = max(strict, ratio_or_inf(excess, fabs(q[j]) if fabs(q[j]) > NOISE * norm[j] else divisor[j]))
-    v = max(row_error, column_error, ratio_or_inf(gap, above_noise(terms, top * top_term)))
-    if not (isfinite(gap) and isfinite(terms) and v == v):
-        v = INFINITY
-    return v, max(v, strict), row_error, column_error, active_, complementary
+        w = at.reach[j] if at.reach[j] > 0.0 else at.divisor[j]
+        v = fabs((at.gradient[j] - at.force[j]) + (at.gradient_lost[j] - at.force_lost[j]))
+        lost = ROUNDING * at.full[j]
+        v = max(v, lost) if at.full[j] > MAX_SIZE_GROWTH * w else max(v - lost, 0.0)
+        strict = max(strict, ratio_or_inf(v, w))
+    v = errors.total if isfinite(terms) else INFINITY
+    return v, max(v, strict), errors.row, errors.column, active_, complementary, hidden
 
 
 cdef inline double approximate_log2(double x) noexcept nogil:
@@ -212,7 +446,7 @@ cdef inline double power_of_two(double x) noexcept nogil:
 
 
 cdef void apply_normal_matrix(const csr_t* p, const csr_t* a, const double* logs, const double* s, double* out) noexcept nogil:
-    """Compute the normal matrix of (6) times s (n + m + 1); entries with a logarithm of inf have no part."""
+    """Compute the normal matrix of (8) times s (n + m + 1); entries with a logarithm of inf have no part."""
     cdef Py_ssize_t i, j, k, n = p.n, at = 0
     cdef double v, total, of_cost = s[n + a.m]
     memset(out, 0, (n + a.m + 1) * sizeof(double))
@@ -237,7 +471,7 @@ cdef void apply_normal_matrix(const csr_t* p, const csr_t* a, const double* logs
 
 cdef void compute_logarithms(const csr_t* p, const csr_t* a, const int32_t* variable, double* top, double* logs, double* rhs,
                              double* diagonal) noexcept nogil:
-    """Compute logs, right-hand side and diagonal of (6); `top` (n) is workspace."""
+    """Compute logs, right-hand side and diagonal of (8); `top` (n) is workspace."""
     cdef Py_ssize_t i, j, k, n = p.n, at = 0
     cdef double v, w
     for j in range(n):
@@ -301,11 +535,11 @@ def equilibrate_program(hessian, q_, jac, t_, variable_, int32_t free):
 
     x = sigma D x', rows are multiplied by E, the cost by c. D, E and g are the least-squares solution of
 
-        sum log2(g |P_jk| D_j D_k)^2 + sum log2(|J_ij| E_i D_j)^2                         (Curtis, Reid 1972)            (6)
+        sum log2(g |P_jk| D_j D_k)^2 + sum log2(|J_ij| E_i D_j)^2                         (Curtis, Reid 1972)            (8)
 
     by conjugate gradients; then E is 1 over the largest entry of each row. sigma is the size of x (`choose_size`). c makes
     the largest entry of the scaled P and q equal to 1. variable_ (m,) is the variable of a row that is a bound, -1 for other
-    rows; bounds have no part in (6).
+    rows; bounds have no part in (8).
 
     Returns
     -------
