@@ -717,6 +717,7 @@ add(
         for k in (
             "reset",
             "restore",
+            "run",
             "set_solver_iterations",
             "set_velocity",
             "set_warm_start",

@@ -166,7 +166,7 @@ def run(
             if folder is not None:
                 recorded += simulation.write_problem(folder, 6) is not None
             start = perf_counter()
-            observation, _, _, _, info = simulation.step()
+            observation, _, _, _, info = simulation.run(1)
             cost[done] = perf_counter() - start
             solver[done] = observation["solver"]
             depth[done] = observation["contacts"]["depth"].max(initial=0.0)

@@ -277,14 +277,54 @@ class Stepping:
             raise InputError(
                 f"action is {action!r}; this simulation has no actions, and None is needed"
             )
+        return self._run_steps(1)
+
+    def run(self, n: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Advance by n steps, bit for bit as n calls of `step`, and return what the last of them returns.
+
+        The built-in sweeps do many steps in one compiled call. The run ends early if the state is no longer finite.
+
+        Parameters
+        ----------
+        n : int
+            Number of steps, at least 1.
+
+        Raises
+        ------
+        InputError
+            `n` is not an integer of 1 or more.
+        SolveFailed, KeyboardInterrupt, LavenderError
+            As `step`. The complete steps before are kept and counted.
+
+        Examples
+        --------
+        >>> import lavender as lv
+        >>> observation, *_, info = lv.Simulation("stack").run(240)
+        >>> info["step"]
+        240
+        """
+        return self._run_steps(check_int("n", n, 1))
+
+    def _run_steps(self, n: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Do n steps, fewer if the state is lost, and return the result of the last one; see `step`."""
         with self._lock:
             if self._refusal:
                 raise LavenderError(self._refusal)
             self._check_can_step()
             self._refusal = INSIDE_STEP
+            per_call = max(
+                1, SUBSTEPS_PER_CALL // self._parameters.substeps
+            )  # Whole steps of a compiled call.
+            lost = ""
             try:
-                self._advance_all_substeps()
-                lost = self._find_lost_body()
+                while n > 0 and not lost:
+                    steps = min(n, per_call) if self._own_sweeps else 1
+                    if self._own_sweeps:
+                        self._advance_by_sweeps(steps)
+                    else:
+                        self._advance_by_solver()
+                    lost = self._find_lost_body()
+                    n -= steps
                 return self._make_observation(), 0.0, bool(lost), False, self._make_step_info(lost)
             finally:
                 self._refusal = ""
@@ -293,26 +333,19 @@ class Stepping:
         if self._end_reason:
             raise LavenderError(f"{self._end_reason}; reset() or restore a snapshot")
 
-    def _advance_all_substeps(self) -> None:
-        """Do all substeps of a step; restore the state before the step if one of them raises."""
-        substeps = self._parameters.substeps
-        first = self.state
-        first_substep = first.head.item(HEAD["step"])
-        failed = self._failed
-        # A registered solver may raise or be interrupted in any substep; the state before the step is then restored
-        # from a copy. A single substep needs no copy: it changes the state only after its solve.
-        needs_copy = substeps > 1 and not self._own_sweeps
+    def _validate_pair_list(self) -> None:
+        """Build the list of pairs again in the next substep if the state comes from a snapshot."""
         if self._restored:
-            invalidate_pair_list(first)
+            invalidate_pair_list(self.state)
             self._restored = False
-        if needs_copy:
-            if self._state_before_step is None or not np.array_equal(
-                self._state_before_step.size, first.size
-            ):
-                self._state_before_step = State(first.size)
-            self._state_before_step.copy_from(first)
+
+    def _advance_by_sweeps(self, steps: int) -> None:
+        """Do steps by the compiled sweeps, and count those that are complete if an error ends them."""
+        self._validate_pair_list()
+        substeps = self._parameters.substeps
+        first_substep = self.state.head.item(HEAD["step"])
+        left = steps * substeps
         try:
-            left = substeps if self._own_sweeps else 0  # Substeps of the compiled sweeps.
             while left > 0:
                 status, done = self.state.kernel.run_substeps(min(left, SUBSTEPS_PER_CALL))
                 left -= done
@@ -320,19 +353,42 @@ class Stepping:
                     self.state = self.state.with_larger_buffers()
                 elif status != OK:
                     break
-            if not self._own_sweeps:
-                self._solve_substeps()
+        finally:
+            done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
+            complete, rest = divmod(done, substeps)
+            self._steps += complete
+            if rest and self.state.head.item(HEAD["lost"]) >= 0:
+                self._steps += 1  # The step in which the state was lost counts.
+            elif rest:
+                self._end_reason = INCOMPLETE_STEP
+
+    def _advance_by_solver(self) -> None:
+        """Do a step by the registered solver; restore the state before the step if a substep raises."""
+        self._validate_pair_list()
+        substeps = self._parameters.substeps
+        first = self.state
+        first_substep = first.head.item(HEAD["step"])
+        failed = self._failed
+        # The solver may raise or be interrupted in any substep; the state before the step is then restored from a
+        # copy. A single substep needs no copy: it changes the state only after its solve.
+        needs_copy = substeps > 1
+        if needs_copy:
+            if self._state_before_step is None or not np.array_equal(
+                self._state_before_step.size, first.size
+            ):
+                self._state_before_step = State(first.size)
+            self._state_before_step.copy_from(first)
+        try:
+            self._solve_substeps()
         except BaseException as error:
             done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
             if done == substeps or self._find_lost_body():
                 self._steps += 1  # All substeps were done before the interruption: count the step.
                 raise
-            if done and self._state_before_step is not None and needs_copy:
+            if done and self._state_before_step is not None:
                 first.copy_from(self._state_before_step)
                 first.head[HEAD["solved"]] = 0
                 self.state = first
-            if done and not needs_copy:
-                self._end_reason = INCOMPLETE_STEP
             self._failed = failed
             if not isinstance(error, SolveFailed):
                 self._last = None  # The arrays of the last solution may have been overwritten.
