@@ -80,6 +80,10 @@ class UnknownName(LavenderError, KeyError):
         return UnknownName.__new__, (UnknownName, self.message), vars(self)
 
 
+#: Packages of the extra `report`.
+REPORT_PACKAGES = ("jinja2", "joblib", "markupsafe", "pandas")
+
+
 def check_name(kind: str, name: object, known: Collection[str]) -> str:
     """Return `name`; raise UnknownName unless it is one of the known names."""
     if not isinstance(name, str) or name not in known:
@@ -116,11 +120,18 @@ class SolveFailed(LavenderError):
 def require_packages(user: str, *names: str) -> None:
     """Raise InputError if a package that `user` needs is not installed; `user` is the subject of the message.
 
-    These packages are dependencies of lavender. They are missing only after an installation without dependencies.
+    Packages of REPORT_PACKAGES belong to the extra `report`. The others are dependencies of lavender, which are missing
+    only after an installation without dependencies.
     """
     missing = [name for name in names if find_spec(name) is None]
     if missing:
-        raise InputError(
-            f"{user} needs {', '.join(missing)}: pip install {' '.join(missing)}; an installation of lavender without "
-            "--no-deps brings every package"
-        )
+        if set(missing) <= set(REPORT_PACKAGES):
+            remedy = (
+                "pip install 'lavender-contact[report]', or in a clone pip install -e '.[report]'"
+            )
+        else:
+            remedy = (
+                f"pip install {' '.join(missing)}; an installation of lavender without --no-deps "
+                "brings the packages of its core, the extra `report` the others"
+            )
+        raise InputError(f"{user} needs {', '.join(missing)}: {remedy}")

@@ -15,6 +15,8 @@ from importlib import import_module
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
+from lavender.base.errors import REPORT_PACKAGES, require_packages
+
 _locks: dict[int, RLock] = {}  # By process.
 _imported = set[str]()  # Names that `import_numerical_modules` has imported completely.
 
@@ -48,6 +50,8 @@ class _LazyModule:
             "__"
         ):  # `copy` reads these names of an uninitialised object.
             raise AttributeError(name)
+        if self._name in REPORT_PACKAGES:
+            require_packages("a table or page", self._name)
         value = getattr(import_module_under_lock(self._name), name)
         setattr(self, name, value)
         return value

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from lavender.base.errors import REPORT_PACKAGES, require_packages
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_file_or_word
 from lavender.cli.measuring import show_page, show_progress
@@ -107,6 +108,7 @@ def audit(
     an answer that is not at its floor has a velocity error above --max-velocity-error. Exit code 130: stopped by
     Ctrl-C; the page shows the completed steps.
     """
+    require_packages("lavender audit", *REPORT_PACKAGES)
     from lavender.audit.audit import audit as run
     from lavender.report.text import format_count
 

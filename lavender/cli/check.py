@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lavender.base.errors import InputError
+from lavender.base.errors import REPORT_PACKAGES, InputError, require_packages
 from lavender.cli.completion import complete_case_or_file, complete_solver
 from lavender.cli.options import (
     ErrorReporter,
@@ -94,6 +94,7 @@ def check(
     or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
+    require_packages("lavender check", *REPORT_PACKAGES)
     from lavender import report
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE

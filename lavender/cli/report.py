@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from lavender.base.arrays import check_float
-from lavender.base.errors import InputError
+from lavender.base.errors import REPORT_PACKAGES, InputError, require_packages
 from lavender.base.exits import EXIT_INTERRUPTED, EXIT_UNMET
 from lavender.cli.completion import complete_case_or_file
 from lavender.cli.measuring import Measured, is_campaign, measure_files, show_progress
@@ -133,6 +133,7 @@ def report(
     if listed:
         _list_suite()
         return
+    require_packages("lavender report", *REPORT_PACKAGES)
     from lavender.report.page import check_columns
     from lavender.report.store import read, select_solvers
     from lavender.report.text import format_count

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lavender.base.errors import REPORT_PACKAGES, require_packages
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.completion import complete_file_or_word
 from lavender.cli.measuring import show_progress
@@ -52,6 +53,7 @@ def slip(
 
     Exit code 1: no state has a contact with friction.
     """
+    require_packages("lavender slip", *REPORT_PACKAGES)
     from lavender.audit.provenance import format_provenance
     from lavender.audit.slip_states import explain_slip_of_states
     from lavender.io.start_states import can_sleep, load_model

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lavender.base.lazy_import import pandas as pd
 from lavender.cli.completion import complete_solver
 from lavender.cli.options import escape_markup, make_console
 
@@ -28,6 +27,9 @@ CAPABILITIES = (
     ("seed", "seed", "accepts seed="),
     ("history", "history", "records history=True"),
 )
+
+#: Columns of a terminal from which the table has the forms of A that a solver reads.
+WIDE = 100
 
 
 @click.command()
@@ -94,25 +96,31 @@ def _describe_solver(name: str) -> None:
 
 def _list_solvers() -> None:
     """Print a table of the solvers, installed ones first."""
+    from rich.table import Table
+
     from lavender.problem import LAWS, OPERATORS
-    from lavender.report.render import print_table
     from lavender.solvers import registry
 
     reasons = registry.known()
-    rows = [
-        {
-            "solver": name,
-            "laws": _join_in_order(LAWS, spec.laws),
-            "reads": _join_in_order(OPERATORS, spec.operators),
-            "capabilities": _get_capabilities(spec),
-            "description": reasons[name] or spec.summary,
-        }
-        for name, spec in sorted(
-            registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0])
-        )
-    ]
     console = make_console()
-    print_table(console, pd.DataFrame(rows), optional=("reads",))
+    shows_operators = console.width >= WIDE
+    heads = ("solver", "laws", "reads", "capabilities", "description")
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for head in heads:
+        if head != "reads" or shows_operators:
+            table.add_column(head, overflow="fold", no_wrap=head == "solver")
+    for name, spec in sorted(
+        registry.specs().items(), key=lambda pair: (bool(reasons[pair[0]]), pair[0])
+    ):
+        reads = [_join_in_order(OPERATORS, spec.operators)] if shows_operators else []
+        laws = _join_in_order(LAWS, spec.laws)
+        cells = (name, laws, *reads, _get_capabilities(spec), reasons[name] or spec.summary)
+        table.add_row(*map(escape_markup, cells))
+    console.print(table, highlight=False)
     console.print()
-    words = [word_and_meaning for _, *word_and_meaning in CAPABILITIES]
-    print_table(console, pd.DataFrame(words, columns=["capability", "meaning"]))
+    meanings = Table(box=None, pad_edge=False, header_style="bold")
+    meanings.add_column("capability", no_wrap=True)
+    meanings.add_column("meaning", overflow="fold")
+    for _, word, meaning in CAPABILITIES:
+        meanings.add_row(word, meaning)
+    console.print(meanings, highlight=False)

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from lavender.base.errors import REPORT_PACKAGES, require_packages
 from lavender.base.exits import EXIT_UNMET
 from lavender.cli.measuring import show_page, show_progress
 from lavender.cli.options import (
@@ -51,6 +52,7 @@ def tune(model: Path, out: Path, quiet: bool, **options: Any) -> None:
     Exit code 1: too few steps have contact, or no setting is within --max-velocity-error. Exit code 130: stopped by
     Ctrl-C; the page shows the completed part.
     """
+    require_packages("lavender tune", *REPORT_PACKAGES)
     from lavender.audit.tune import tune as run
 
     check_writable(out, folder=True)

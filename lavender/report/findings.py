@@ -9,10 +9,10 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import pandas as pd
 from lavender.problem.derived import cached_property
 from lavender.report import figures, tables
 from lavender.report.drawing import FigureFolder

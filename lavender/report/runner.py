@@ -161,7 +161,7 @@ def run(
         joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a
         plan that measures times, or a worker was lost; the rows that were stored stay.
     """
-    require_packages("a measurement", "joblib", "threadpoolctl")
+    require_packages("a measurement", "joblib", "pandas", "threadpoolctl")
     check_workers(workers)
     spread = workers != 1 or backend != "loky"
     plan = plan or (CampaignPlan() if spread else Plan())

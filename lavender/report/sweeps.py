@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup, escape
 
+from lavender.base.lazy_import import pandas as pd
 from lavender.report import drawing
 from lavender.report.page import make_table
 from lavender.report.tables import Contents, list_plain_sweeps, read_own_answers

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import pandas as pd
 
 from lavender import io
 from lavender.base.arrays import check_choice
 from lavender.base.deadline import format_seconds
 from lavender.base.errors import LavenderError
+from lavender.base.lazy_import import pandas as pd
 from lavender.io.stored import SUFFIXES
 from lavender.judge.residuals import DEFAULT_THRESHOLD, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED

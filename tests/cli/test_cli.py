@@ -230,22 +230,53 @@ def test_check_of_a_stored_answer_ends_with_1_only_if_its_error_exceeds_the_thre
         ("import lavender.cli", "the command line needs click, rich: pip install click rich"),
         (
             "lv.report.run(['granularF(n=3)'], ['pgs'])",
-            "a measurement needs joblib: pip install joblib",
+            "a measurement needs joblib, pandas: pip install 'lavender-",
+        ),
+        (
+            "lv.report.read('records.jsonl')",
+            "a table of runs needs pandas: pip install 'lavender-contact[report]'",
+        ),
+        (
+            "lv.cross_check(lcp, ['pgs', 'direct']).frame",
+            "a table or page needs pandas: pip install 'lavender-contact",
         ),
         (
             "lv.solve(lcp, 'pgs', history=True).history.plot()",
             "History.plot needs matplotlib: pip install",
         ),
-        ("lv.suite; print(lv.cross_check(lcp, ['pgs', 'direct']))", "agrees"),
+        ("lv.suite; print(lv.solve(lcp, 'osqp'), lv.solve(lcp, 'direct'))", "CONVERGED"),
     ],
 )
 def test_call_without_an_optional_package_names_the_command_to_install_it(call, message):
-    names = ["click", "rich", "joblib", "matplotlib"]
+    names = ["click", "rich", "joblib", "matplotlib", "pandas"]  # OSQP needs jinja2
     code = f"import sys\nfor name in {names}: sys.modules[name] = None\nimport lavender as lv\n"
     code += f"lcp = lv.Problem.lcp([[2.0]], [1.0])\n{call}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert message in done.stdout + done.stderr
     assert "ModuleNotFoundError" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "command", ["report", "audit box.xml", "slip box.xml", "tune box.xml", "check stack(n=4)"]
+)
+def test_command_without_the_extra_report_names_it(command):
+    """`lavender solve`, `solvers` and `explain` do their work without it."""
+    block = "import sys\nsys.modules['pandas'] = None\n"
+    code = f"{block}from lavender.cli import main\nmain({command.split()})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert (
+        "pip install 'lavender-contact[report]', or in a clone pip install -e '.[report]'"
+        in done.stderr
+    )
+
+
+@pytest.mark.parametrize("command", ["solvers", "solve stack(n=4)", "explain stack(n=4)"])
+def test_command_of_the_core_works_without_the_extra_report(command):
+    block = "import sys\nsys.modules['pandas'] = None\n"
+    code = f"{block}from lavender.cli import main\nmain({command.split()})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def reject_constant(word):

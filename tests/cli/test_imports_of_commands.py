@@ -44,7 +44,7 @@ SLOW = {
 NEEDED = {
     "explain problem.npz": set(),
     "run stack --steps 2": set(),
-    "solvers": {"pandas", "rich"},
+    "solvers": {"rich"},
     "record box.xml --record-every 1 --steps 2 --out recorded": {"mujoco", "scipy"},
     "audit box.xml --worlds 2 --steps 3 --out audited": {
         "mujoco",
