@@ -9,7 +9,8 @@ Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
 Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
            of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the
-           data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide)
+           data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide), `compare`
+           (why two engines, or an engine and the rigid laws, differ after a step)
 Engine     `Scene`, `Simulation`
 Measuring  `report`, `suite` (built-in problems), `io` (files and other simulators)
 
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from lavender.batch.data import Batch
     from lavender.batch.residuals import Residuals, residual_many
     from lavender.batch.solve import Solutions, solve_many
+    from lavender.causes.comparison import Comparison, compare
     from lavender.diagnostics import Diagnostic, diagnose
     from lavender.diagnostics.motion_error import MotionError, motion_error
     from lavender.diagnostics.redundancy import Redundancy, redundancy
@@ -81,6 +83,7 @@ _LAZY_NAMES = {
     "lavender.batch.data": ("Batch",),
     "lavender.batch.residuals": ("Residuals", "residual_many"),
     "lavender.batch.solve": ("Solutions", "solve_many"),
+    "lavender.causes.comparison": ("Comparison", "compare"),
     "lavender.gradient": ("Derivative", "derivative", "derivatives"),
     "lavender.io": ("load",),
     "lavender.report.check": ("CrossCheck", "cross_check"),
@@ -124,6 +127,7 @@ __all__ = [
     "Batch",
     "CapabilityError",
     "Claim",
+    "Comparison",
     "Cones",
     "CrossCheck",
     "Derivative",
@@ -157,6 +161,7 @@ __all__ = [
     "__version__",
     "available",
     "available_solvers",
+    "compare",
     "cross_check",
     "derivative",
     "derivatives",

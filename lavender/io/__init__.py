@@ -9,7 +9,8 @@
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
 from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
 `from_kamino`, `from_newton_mujoco` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo
-simulation to a folder, `Recorder` writes problems from any loop.
+simulation to a folder, `Recorder` writes problems from any loop. `step_from_mujoco` reads everything that determines
+one step, for `lavender.compare`; `save_step` and `load_step` store it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
+from lavender.io.mujoco_step import step_from_mujoco
 from lavender.io.newton_mujoco import from_newton_mujoco
 from lavender.io.npz import Stored, read_npz, write_npz
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
+from lavender.io.step_record import StepRecord, load_step, permute_velocities, save_step
 from lavender.io.stored import HDF5, as_path, read_bytes
 from lavender.io.velocities import Reconstruction, reconstruct
 from lavender.problem import Problem
@@ -43,6 +46,7 @@ __all__ = [
     "Reconstruction",
     "Recorder",
     "Recording",
+    "StepRecord",
     "StepVerdict",
     "Stored",
     "drake",
@@ -57,12 +61,16 @@ __all__ = [
     "from_pinocchio",
     "load",
     "load_solution",
+    "load_step",
     "mujoco",
+    "permute_velocities",
     "read",
     "read_recorded_state",
     "reconstruct",
     "record",
     "save",
+    "save_step",
+    "step_from_mujoco",
 ]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 

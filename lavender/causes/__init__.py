@@ -1,0 +1,1 @@
+"""Why two engines, or an engine and the rigid law, make different velocities in one step."""

@@ -1,0 +1,183 @@
+"""Why two engines make different velocities in one step: parts of the difference by their causes.
+
+    a = lavender.io.step_from_mujoco(model, data)
+    b = lavender.io.step_from_genesis(scene, velocity)
+    print(lavender.compare(a, b))
+    print(lavender.compare(a))                      # against the rigid laws
+
+The step has six ingredients: the masses with their gravity, the forces, the integrator with dampings and actuators, the
+rows, their softness, and friction. All mixtures of the ingredients of both engines are solved
+(`lavender.causes.mixture`). The part of an ingredient is the mean, over all orders in which the ingredients can be
+exchanged one after another, of the change of velocity by its exchange (Shapley 1953); the interval contains the changes
+of all orders. Parts within an ingredient are means over the orders within it (Owen 1977). The parts, and what the
+solvers leave, sum to the difference:
+
+    v_b - v_a = sum of parts + state + solver + lost digits + noslip + rest
+    state = effect of rounding of the velocities before the step
+    solver = (own answer - exact answer) of b, minus the same of a
+    lost digits = the same, if the engine's acceleration is exact and its forces, which its integrator uses, are not
+    noslip = change of b's answer by its pass against slip, minus the same of a
+    rest = (v_b - velocity predicted from b's answer), minus the same of a
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError, InputError
+from lavender.causes.difference import LEFT_OVER, Difference, Part
+from lavender.causes.exchange import Mixtures, expand
+from lavender.causes.facts import Fact, Proposal, list_facts, list_proposals
+from lavender.causes.ideal import make_ideal_twin
+from lavender.causes.matching import Pairing
+from lavender.causes.mixture import INGREDIENTS, PARTS
+from lavender.causes.text import describe
+from lavender.io.step_record import StepRecord, get_force
+
+# [-] Largest difference of the velocities before the step, relative to the largest velocity and to 1 m/s: rounding of
+# float32 and of conversions of coordinates.
+MAX_START_DIFFERENCE = 1e-4
+MAX_TIME_STEP_DIFFERENCE = 1e-6  # [-]
+# [-] An acceleration with at most this part of the forces' error is exact: the forces have lost their digits.
+MAX_ACCELERATION_ERROR = 0.1
+
+
+class Comparison(Difference):
+    """Difference of the velocities of two engines after one step, and its parts; `str()` explains it."""
+
+    @property
+    def facts(self) -> list[Fact]:
+        """What differs between the two steps, with the numbers that a user can change."""
+        return [] if self.is_ideal else list_facts(self)
+
+    @property
+    def proposals(self) -> list[Proposal]:
+        """Changes of the second engine that reduce the largest difference; each one is solved."""
+        return list_proposals(self)
+
+    def __str__(self) -> str:
+        return describe(self)
+
+
+def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
+    """Explain the difference of the velocities of two engines after one step.
+
+    Parameters
+    ----------
+    a, b : StepRecord
+        The same step of two engines, two versions, two models or two sets of options, from
+        `lavender.io.step_from_mujoco` and its siblings or from a file of `lavender.io.save_step`. Without `b`, `a` is
+        compared with the rigid laws: the first record of the result is the ideal twin of `a`.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        The steps differ in their length, in the number of velocities, or in the velocities before the step.
+    CapabilityError
+        An exact solution of one of the steps is not found.
+
+    Notes
+    -----
+    Source of the parts: Shapley, "A Value for n-Person Games", 1953, and Owen, "Values of Games with a Priori Unions",
+    1977.
+    """
+    for name, record in (("a", a), ("b", b)):
+        if not isinstance(record, StepRecord) and not (name == "b" and record is None):
+            raise InputError(
+                f"{name} is a {type(record).__name__}; a StepRecord of lavender.io.step_from_mujoco, "
+                "step_from_genesis, step_from_newton_mujoco, step_from_kamino or load_step is needed"
+            )
+    is_ideal = b is None
+    if b is None:
+        a, b = make_ideal_twin(a), a
+    _check_steps(a, b)
+    pairing = Pairing.of_records(a, b)
+    solved = Mixtures(a, b, pairing)
+    exact_a, whole = solved.solve({}), solved.solve(dict.fromkeys(PARTS, True))
+    if not (exact_a.is_solved and whole.is_solved):
+        worst = max(exact_a.relative, whole.relative)
+        raise CapabilityError(
+            f"an exact solution of these steps is not found (relative residual {worst:.1e}), so their difference has "
+            "no parts"
+        )
+    active = tuple(
+        name for name, parts in INGREDIENTS.items() if any(p in solved.different for p in parts)
+    )
+    own = {name: solved.divide(name, active) for name in active}
+    has_same_start = np.array_equal(a.velocity, b.velocity)
+    exact_b = whole.velocity if has_same_start else solved.solve_with_own_start().velocity
+    leaves = _measure_left_over(a, b, exact_a.velocity, exact_b, whole.velocity)
+    own |= leaves
+    corners = {
+        bits: solved.solve(expand(dict(zip(active, bits, strict=True))))
+        for bits in itertools.product((False, True), repeat=len(active))
+    }
+    result = Comparison(
+        a, b, own, exact_a.velocity, exact_b, pairing, corners, active, is_ideal,
+        tuple(solved.warnings),
+    )  # fmt: skip
+    return result
+
+
+def _check_steps(a: StepRecord, b: StepRecord) -> None:
+    """Raise InputError unless both records describe the same step."""
+    if len(a.velocity) != len(b.velocity):
+        raise InputError(
+            f"a has {len(a.velocity)} velocities and b {len(b.velocity)}: both must be the same model, with the same "
+            "joints"
+        )
+    if abs(a.dt - b.dt) > MAX_TIME_STEP_DIFFERENCE * a.dt:
+        raise InputError(f"a has a time step of {a.dt:g} s and b of {b.dt:g} s: give both the same")
+    unlike = [f"{x} and {y}" for x, y in zip(a.names, b.names, strict=True) if x != y]
+    if unlike:
+        raise InputError(
+            f"{len(unlike)} velocities have different names, first {unlike[0]}: give b the order of a "
+            "(lavender.io.permute_velocities)"
+        )
+    size = max(1.0, float(np.abs(a.velocity).max(initial=0.0)))
+    gap = np.abs(a.velocity - b.velocity)
+    if gap.max(initial=0.0) > MAX_START_DIFFERENCE * size:
+        i = int(np.argmax(gap))
+        raise InputError(
+            f"{a.names[i]} has velocity {a.velocity[i]:.6g} in a and {b.velocity[i]:.6g} in b before the step: both "
+            "must start from the same state, with free bodies rotated alike"
+        )
+    if a.position is not None and b.position is not None and len(a.position) == len(b.position):
+        gap = np.abs(a.position - b.position)
+        if gap.max(initial=0.0) > MAX_START_DIFFERENCE * max(1.0, float(np.abs(a.position).max())):
+            i = int(np.argmax(gap))
+            raise InputError(
+                f"position {i} is {a.position[i]:.6g} in a and {b.position[i]:.6g} in b before the step: both must "
+                "start from the same state"
+            )
+
+
+def _measure_left_over(
+    a: StepRecord, b: StepRecord, exact_a: FloatArray, exact_b: FloatArray, exchanged: FloatArray
+) -> dict[str, Part]:
+    """Return the parts that no mixture has: state, solver, noslip and rest."""
+    total = {name: np.zeros_like(exact_a) for name in LEFT_OVER}
+    for sign, record, exact in ((-1.0, a, exact_a), (1.0, b, exact_b)):
+        own = record.own_velocity
+        solved = own
+        if record.before_noslip is not None:
+            slipping = [get_force(x) for x in record.blocks]
+            change = record.velocity_of(slipping) - record.velocity_of(record.before_noslip)
+            solved = own - change
+        cause, error = "solver", solved - exact
+        if record.moved_by == "forces" and record.acceleration is not None and solved is own:
+            by_acceleration = np.abs(record.velocity_from_acceleration - exact).max(initial=0.0)
+            if by_acceleration < MAX_ACCELERATION_ERROR * np.abs(error).max(initial=0.0):
+                cause = "lost digits"
+        total[cause] += sign * error
+        total["noslip"] += sign * (own - solved)
+        total["rest"] += sign * (record.velocity_after - own)
+    total["state"] = exact_b - exchanged
+    return {n: Part(n, v, v[None], v, v) for n, v in total.items()}

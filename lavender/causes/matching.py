@@ -1,0 +1,97 @@
+"""Find for each constraint of one step the same constraint in the step of another engine.
+
+Contacts of the same two bodies are matched by their geoms and then by the smallest sum of distances, whatever their
+number of rows; all other constraints by their keys. A contact without a partner borrows the settings of the nearest
+contact of the same bodies in the other engine. A constraint that is not active there has the settings that the other
+engine's model gives it, if they are known.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
+
+# [m] Added to the distance of two contacts of the same bodies if their geoms have other names.
+OTHER_GEOMS_DISTANCE = 1e3
+
+
+@dataclass(eq=False)
+class Pairing:
+    """Partners of the blocks of two records."""
+
+    records: tuple[StepRecord, StepRecord]
+    # For each record: index of the partner in the other record, or -1.
+    partners: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
+    # For each record: index of the block in the other record that lends its settings, or -1.
+    lenders: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
+
+    @classmethod
+    def of_records(cls, a: StepRecord, b: StepRecord) -> Pairing:
+        """Match the blocks of two records."""
+        from scipy.optimize import linear_sum_assignment
+
+        pairing = cls((a, b), ([-1] * len(a.blocks), [-1] * len(b.blocks)))
+        groups: dict[str, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
+        for side, record in enumerate((a, b)):
+            for i, block in enumerate(record.blocks):
+                groups[block.key][side].append(i)
+        for ours, theirs in groups.values():
+            if not ours or not theirs:
+                continue
+            cost = np.array(
+                [[measure_distance(a.blocks[i], b.blocks[j]) for j in theirs] for i in ours]
+            )
+            for i, j in zip(*linear_sum_assignment(cost), strict=True):
+                pairing.partners[0][ours[i]] = theirs[j]
+                pairing.partners[1][theirs[j]] = ours[i]
+        for side, (record, other) in enumerate(((a, b), (b, a))):
+            for i, block in enumerate(record.blocks):
+                partner = pairing.partners[side][i]
+                if partner < 0 and block.role == "contact":
+                    alike = [
+                        (measure_distance(block, x), j)
+                        for j, x in enumerate(other.blocks)
+                        if x.key == block.key
+                    ]
+                    partner = min(alike)[1] if alike else -1
+                pairing.lenders[side].append(partner)
+        return pairing
+
+    def side_of(self, record: StepRecord) -> int:
+        """Return 0 for the first record and 1 for the second."""
+        return 0 if record is self.records[0] else 1
+
+    def find(self, source: StepRecord, base: StepRecord, i: int) -> ConstraintBlock | None:
+        """Return the block of `source` that is the same as block i of `base`, or lends its settings; else None."""
+        if source is base:
+            return base.blocks[i]
+        j = self.lenders[self.side_of(base)][i]
+        return None if j < 0 else source.blocks[j]
+
+    def find_softness(self, source: StepRecord, base: StepRecord, i: int) -> Softness | None:
+        """Return the softness that `source` gives to block i of `base`; None if it is not known."""
+        block = self.find(source, base, i)
+        return source.softnesses.get(base.blocks[i].key) if block is None else block.softness
+
+    def list_unmatched(self, side: int) -> list[ConstraintBlock]:
+        """Return the blocks of one record that the other one does not have."""
+        blocks = self.records[side].blocks
+        return [x for x, j in zip(blocks, self.partners[side], strict=True) if j < 0]
+
+    def list_unknown(self, side: int) -> list[ConstraintBlock]:
+        """Return the blocks of one record to which the other engine's settings are not known."""
+        base, source = self.records[side], self.records[1 - side]
+        return [
+            x for i, x in enumerate(base.blocks)
+            if x.role != "friction" and self.find_softness(source, base, i) is None
+        ]  # fmt: skip
+
+
+def measure_distance(a: ConstraintBlock, b: ConstraintBlock) -> float:
+    """Return the distance of two blocks [m], with `OTHER_GEOMS_DISTANCE` for contacts of other geoms."""
+    are_other = bool(a.geoms and b.geoms) and set(a.geoms) != set(b.geoms)
+    return float(np.linalg.norm(a.position - b.position)) + OTHER_GEOMS_DISTANCE * are_other
