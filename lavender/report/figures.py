@@ -37,24 +37,38 @@ def draw_time_to_accuracy(
 ) -> str:
     """Draw the mean time of each solver to each tolerance, with values at the ends of the lines."""
     tolerances = report.tolerances
-    means = {t: rank_solvers(report, t, report.subject)["mean"] for t in tolerances}
-    times = {
-        name: [float(means[t].get(name, report.time_limit)) for t in tolerances] for name in names
+    rankings = {t: rank_solvers(report, t, report.subject).reindex(names) for t in tolerances}
+    times = {name: [float(rankings[t].at[name, "mean"]) for t in tolerances] for name in names}
+    n = len(report.subject)
+    solved = {
+        name: [int(np.nan_to_num(rankings[t].at[name, "solved"])) for t in tolerances]
+        for name in names
     }
+
+    def describe_last(name: str) -> str:
+        """Return the mean time to the tightest tolerance that a solver reaches, and how many problems it solves."""
+        last = max((i for i, count in enumerate(solved[name]) if count), default=-1)
+        some = f", {solved[name][last]}/{n}" if last >= 0 and solved[name][last] < n else ""
+        return f"{name} {format_time(times[name][last])}{some}" if last >= 0 else f"{name}: none"
 
     def fill(axes: Any) -> str:
         every = np.concatenate(list(times.values()))
         axes.set_yscale("log")
         axes.set_xlim(-0.12, len(tolerances) - 1)
-        axes.set_ylim(max(every.min(), 1e-9) / 1.3, every.max() * 1.25)
+        known = every[np.isfinite(every)]
+        axes.set_ylim(max(known.min(), 1e-9) / 1.3, known.max() * 1.25)
         labels = []
         for i, (name, own) in enumerate(times.items()):
             style = drawing.style_line(i)
             axes.plot(range(len(own)), own, clip_on=False, **style)
+            part = [k for k, count in enumerate(solved[name]) if 0 < count < n]
+            if part:
+                hollow = style | {"linestyle": "", "markerfacecolor": drawing.PAPER, "zorder": 8}
+                axes.plot(part, [own[k] for k in part], clip_on=False, **hollow)
             weight = "normal" if i else "bold"
-            labels.append(
-                drawing.Label(own[-1], f"{name} {format_time(own[-1])}", style["color"], weight)
-            )
+            ends = [t for t in own if np.isfinite(t)]
+            y = ends[-1] if ends else float(known.max())
+            labels.append(drawing.Label(y, describe_last(name), style["color"], weight))
         axes.set_xticks(range(len(tolerances)), list(map(format_power, tolerances)))
         axes.set_xlabel("residual to reach (1: no impulse)")
         axes.yaxis.set_major_formatter(lambda t, _: format_time(t))
@@ -63,16 +77,18 @@ def draw_time_to_accuracy(
         drawing.label_ends(axes, labels)
         texts = []
         for name, own in times.items():
-            parts = (
-                f"{format_time(t)} to {format_power(x)}"
-                for t, x in zip(own, tolerances, strict=True)
-            )
+            parts = [
+                f"{format_time(t)} to {format_power(x)}" + (f" on {count}" if count < n else "")
+                for t, x, count in zip(own, tolerances, solved[name], strict=True)
+                if count
+            ]
             texts.append(f"{name}: {', '.join(parts)}")
         return f"Mean time. {'; '.join(texts)}"
 
-    n, limit = len(report.subject), format_time(report.time_limit)
-    note = f"Mean time over {format_count(n, 'problem')}, unsolved ones at {limit} (tables/solvers.csv)."
-    margins = drawing.fit_margins([f"{name} {format_time(own[-1])}" for name, own in times.items()])
+    is_partial = any(0 < count < n for counts in solved.values() for count in counts)
+    hollow = "; hollow: not all, their number is at the end" if is_partial else ""
+    note = f"Mean time of the solved of {format_count(n, 'problem')}{hollow} (tables/solvers.csv)."
+    margins = drawing.fit_margins([describe_last(name) for name in times])
     return drawing.draw_figure(
         "time-to-accuracy", fill, FIGURE_SIZE, margins, note=note, folder=folder
     )

@@ -22,6 +22,7 @@ from lavender.report.runner import Event
 from lavender.report.sweeps import SweepStudy
 from lavender.report.tables import ENGINE_NAME, Contents, is_plug_in, rank_solvers
 from lavender.report.text import (
+    NONE,
     escape_unprintable,
     format_count,
     format_power,
@@ -56,9 +57,9 @@ HOW_TO_READ = (
     "Times are wall-clock times of one call of lv.solve (of a quadratic program lv.solve_qp) with the judge and "
     "Python, whose share below about 0.2 ms is as large as the solver's: the minimum of the repetitions. The residual "
     "is the judge's relative residual, 1 at the zero impulse and 0 at a solution; of a quadratic program it is the "
-    "largest error of rows, columns and gap. Means are geometric, shifted by 10 µs; a problem that a solver does not "
-    "solve or does not accept counts as the time limit. Solvers tie if their means differ by less than twice the "
-    "spread of their repetitions. Problems that the zero impulse solves are not ranked."
+    "largest error of rows, columns and gap. A checked proof solves a problem without a solution. Means are geometric "
+    "(shift 10 µs), of the solved problems; ratios are of those that both solve. Solvers tie if their means differ by "
+    "less than twice the spread of their repetitions. Problems that the zero impulse solves are not ranked."
 )
 
 
@@ -153,16 +154,21 @@ class Report(Contents):
         some = f"all {named}" if row["solved"] == n else f"{row['solved']} of {named}"
         solved = named if n == 1 else some
         use = "Stopped early; so far, use" if self.is_stopped else "Use"
+        if row["proven"] and n == 1:
+            time = "" if self.is_campaign else f", in {format_time(row['mean'])}"
+            return f"{use} {self.first}: it proves that {named} has no solution{time}."
         text = f"{use} {self.first}: it solves {solved}"
+        if row["proven"]:
+            they = "that it has no solution" if row["proven"] == 1 else "that they have no solution"
+            text += f" ({row['proven']} by a proof {they})"
         if self.is_campaign:
             return f"{text} {target} (no times were measured)."
         time = format_time(row["mean"])
         if n == 1:
             return f"{text} {target} in {time}."
-        unsolved = (
-            "" if row["solved"] == n else f"; unsolved ones at {format_time(self.time_limit)}"
-        )
-        return f"{text}, in {time} on average ({format_time(row['worst'])} at worst, on {row['hardest']}{unsolved})."
+        these = "" if row["solved"] == n else "these "
+        worst = f"{format_time(row['worst'])} at worst, on {row['hardest']}"
+        return f"{text}, {these}in {time} on average ({worst})."
 
     @cached_property
     def sentences(self) -> list[str]:
@@ -189,7 +195,7 @@ class Report(Contents):
             return f"As many are solved by {_join(rivals.index)}." if len(rivals) else ""
         ties = rivals.index[rivals["tie"]]
         others = rivals[~rivals["tie"]].head(3)
-        texts = [f"{name} takes {r / row['mean']:.1f}×" for name, r in others["mean"].items()]
+        texts = [f"{name} takes {r:.1f}×" for name, r in others["ratio"].items() if r == r]
         texts = [*texts[:1], *(text.replace(" takes", "") for text in texts[1:])]
         tied = f"{_join(ties)} tie{'s' * (len(ties) == 1)} with it" if len(ties) else ""
         text = "; ".join(filter(None, (tied, f"{', '.join(texts)} that time" if texts else "")))
@@ -244,7 +250,8 @@ class Report(Contents):
             first = str(solvers.index[0])
             row = solvers.iloc[0]
             text = f"For the {self._describe_cases(steps)} use {first}: it solves {row['solved']}"
-            text += f", in {format_time(row['mean'])} on average. "
+            these = "" if row["solved"] == row["cases"] else "these "
+            text += f", {these}in {format_time(row['mean'])} on average. "
         runs = self.ranked_runs[
             self.ranked_runs["case"].isin(steps) & (self.ranked_runs["solver"] == first)
         ]
@@ -281,7 +288,10 @@ class Report(Contents):
             return ()
         runs = self.ranked_runs
         runs = runs[runs["case"].isin(self.subject) & (runs["solver"] == self.first)]
-        runs = runs[runs[["tol", "relative"]].max(axis=1) <= self.tolerance]
+        runs = self.select_answers(runs, self.tolerance)
+        # A proof for a looser tolerance is an answer, too, but no call to this tolerance.
+        within = runs[runs["tol"] <= self.tolerance]
+        runs = within if len(within) else runs
         runs = runs[runs["tol"] == runs["tol"].max()]
         call = SimpleNamespace(**runs.loc[runs["iterations"].astype(int).idxmax()].to_dict())
         return format_call(call, bool((self.cases.loc[self.subject, "guess"] != "").any()))
@@ -452,9 +462,10 @@ class Report(Contents):
         always = [name == ENGINE_NAME or is_plug_in(name) for name in ranking.index]
         shown = ranking[(np.arange(len(ranking)) < MAX_SOLVERS) | np.array(always, bool)]
         n = int(ranking["cases"].iloc[0]) if len(ranking) else 0
-        means = shown["mean"].clip(lower=1e-9)
+        means = shown["mean"].dropna().clip(lower=1e-9)
         low = np.log10(means.min()) - 0.03
         high = np.log10(means.max()) + 0.03
+        best = self.first or ranking.index[0]
         has_false = bool((shown["false"] > 0).any())
         for name, row in shown.iterrows():
             css = "first" if name == self.first else ""
@@ -465,13 +476,14 @@ class Report(Contents):
             notes += ["tie"] if row["tie"] and shown["tie"].sum() > 1 else []
             cells: list[Any] = [(str(name), css, ""), (f"{row['solved']}/{n}", css, "")]
             if not self.is_campaign:
-                ratio = row["mean"] / ranking.loc[self.first or ranking.index[0], "mean"]
+                is_known = row["mean"] == row["mean"]
                 place = 100.0 * (np.log10(max(row["mean"], 1e-9)) - low) / (high - low)
                 dot = Markup(f'<span class="dot"><i style="left:{place:.1f}%"></i></span>')
+                ratio = row["ratio"]
                 cells += [
-                    (format_time(row["mean"]), css, ""),
-                    (f"{ratio:.1f}", css, ""),
-                    (dot, "bar", ""),
+                    (format_time(row["mean"]) if is_known else NONE, css, ""),
+                    (f"{ratio:.1f}" if ratio == ratio else NONE, css, ""),
+                    (dot if is_known else "", "bar", ""),
                 ]
             if has_false:
                 cells.append(
@@ -484,8 +496,8 @@ class Report(Contents):
         note = ""
         if n > 1 and not self.is_campaign:
             note = (
-                f"Shifted geometric mean (10 µs), on a logarithmic scale; a problem not solved or not accepted "
-                f"(its law, form or size) counts as {format_time(self.time_limit)}."
+                "Geometric mean (shift 10 µs) of the solved problems, on a logarithmic scale. × best: of those that "
+                f"{best} solves, too."
             )
             note += (
                 f" The table below has all {len(ranking)} solvers."
@@ -704,18 +716,14 @@ def make_latex_table(report: Report) -> str:
         for x in report.tolerances
         if not report.is_campaign
     }
-    middle = times.get(format_tol(report.tolerance), "")
     known: dict[str, Any] = {
         "solved": table["solved"].astype(str) + "/" + table["cases"].astype(str),
         "accepted": table["accepted"],
         "false": table["false claims"],
-        **{f"{word}": 1e3 * table[head] for word, head in times.items()},
+        **{word: _format_paper_times(table, word, head) for word, head in times.items()},
     }
     if times:
-        known |= {
-            "ratio": table[middle] / table[middle].min(),
-            "slowest": 1e3 * table["slowest [s]"],
-        }
+        known |= {"ratio": table["× best"], "slowest": 1e3 * table["slowest [s]"]}
     columns = [
         x if x in PAPER_COLUMNS else format_tol(float(x))
         for x in report.columns or ("solved", *times)
@@ -724,17 +732,20 @@ def make_latex_table(report: Report) -> str:
     heads = {"false": "false claims", "ratio": r"$\times$ best", "slowest": "slowest [ms]"} | {
         word: f"$10^{{{round(np.log10(float(word)))}}}$" for word in times
     }
-    paper = pd.DataFrame({heads.get(name, name): known[name].to_numpy() for name in columns})
+    paper = pd.DataFrame({heads.get(name, name): list(known[name]) for name in columns})
     paper.index = pd.Index(table["solver"].map(_escape_latex))
     paper.index.name = None
     paper = paper.where(~paper.isin([np.inf, -np.inf]))
-    numbers = [heads.get(name, name) for name in columns if name in (*times, "ratio", "slowest")]
+    numbers = [heads.get(name, name) for name in columns if name in ("ratio", "slowest")]
     caption = f"Problems solved to a residual of {format_tol(report.tolerance)}"
     if set(columns) & set(times):
-        caption += ", and shifted geometric mean of the time [ms] to each residual"
+        caption += (
+            ", and shifted geometric mean (10 µs) of the time [ms] to each residual over the solved problems, with "
+            "their number if some are not solved or not accepted; bold: the smallest of the solvers that solve most"
+        )
     caption += (
-        f" over {format_count(int(table['cases'].max()), 'problem')} (shift 10 µs; unsolved or not accepted at "
-        f"{report.time_limit:g} s). lavender {_escape_latex(str(report.machine.get('lavender', '')))}, "
+        f". {format_count(int(table['cases'].max()), 'problem')}, limit {report.time_limit:g} s each. "
+        f"lavender {_escape_latex(str(report.machine.get('lavender', '')))}, "
         f"{_escape_latex(str(report.machine.get('cpu', '')))}, one thread."
     )
     style = paper.style.format(precision=3, na_rep="--", subset=numbers)
@@ -746,6 +757,19 @@ def make_latex_table(report: Report) -> str:
         position="t",
         caption=caption,
     )
+
+
+def _format_paper_times(table: pd.DataFrame, word: str, head: str) -> list[str]:
+    """Return the mean times [ms] of a table's column `head`, with the number of solved problems if some are not."""
+    solved = table.get(f"solved to {word}", table["solved"])
+    best = table.loc[solved == solved.max(), head].min()
+    texts = []
+    for time, count, n in zip(table[head], solved, table["cases"], strict=True):
+        some = f" ({count}/{n})" if 0 < count < n else ""
+        text = f"{1e3 * time:.3f}" if count else "--"
+        is_best = count == solved.max() > 0 and time == best
+        texts.append((rf"\textbf{{{text}}}" if is_best else text) + some)
+    return texts
 
 
 def _escape_latex(text: str) -> str:
@@ -800,7 +824,7 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
             frame = frame[[head for head in wanted if head in frame]]
         elif not complete:
             frame = frame.head(MAX_SOLVERS)
-            optional = ("tie", "false claims", "accepted", "slowest [s]")
+            optional = ("tie", "× best", "accepted", "false claims", "slowest [s]")
         print_table(console, frame, optional)
 
 

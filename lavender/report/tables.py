@@ -1,8 +1,9 @@
 """Rank the runs of a report and make its tables: group-bys of its frame of runs, with units in the names of columns.
 
 The time of a solver to a tolerance on a case is the shortest time of its runs to this or a tighter tolerance with a
-judged residual of at most the tolerance. Runs with a fixed budget do not count, since a reader cannot choose the budget
-in advance. Single cases count from a cold start, steps of a sequence with carried impulses if the solver takes a start.
+judged residual of at most the tolerance; of a case without a solution, of its checked proofs. Runs with a fixed budget
+do not count, since a reader cannot choose the budget in advance. Single cases count from a cold start, steps of a
+sequence with carried impulses if the solver takes a start.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ SERVED_RESIDUAL = 0.5  # A case is served if at most this fraction of the start'
 SERVED_QUANTILE = 0.9
 RESIDUAL_NOISE_FACTOR = 2.0  # Residuals within this factor count as equal.
 DEATHS = ("ERROR", "KILLED", "CRASHED")
+PROOFS = ("INFEASIBLE", "UNBOUNDED")  # Statuses that a checked certificate makes an answer.
 # An exponent is fitted to at least so many cases and ratio of rows.
 MIN_FIT_CASES, MIN_FIT_SIZE_RATIO = 4, 4.0
 # [s] Added to times in geometric means. In shorter calls, the overhead of Python dominates.
@@ -83,6 +85,11 @@ STRUCTURE_ORDER = (
 # -- ranking -----------------------------------------------------------------------------------------------
 
 
+def is_proof(runs: Frame) -> pd.Series[bool]:
+    """Return whether each run has proven, and the judge has checked, that its case has no solution or no optimum."""
+    return runs["status"].isin(PROOFS) & (runs["claim_check"] == CONFIRMED)
+
+
 def select_starts(runs: Frame) -> Frame:
     """Return the runs from the start that counts: cold, or carried over the steps of a sequence."""
     single = runs["step"] < 0
@@ -115,16 +122,27 @@ def group_cases_by_structure(frame: Frame) -> dict[str, list[str]]:
 
 
 def compute_mean(times: Any, axis: int = 0) -> Any:
-    """Compute the geometric mean of times [s], shifted by `MEAN_TIME_SHIFT`; of a frame or series without nan."""
+    """Compute the geometric mean, shifted by `MEAN_TIME_SHIFT`, of the times [s] of a frame or series without nan."""
     return np.exp(np.log(np.add(times, MEAN_TIME_SHIFT)).mean(axis=axis)) - MEAN_TIME_SHIFT
+
+
+def compute_ratios(times: Frame, best: str = "") -> list[float]:
+    """Return the mean time of each row divided by that of the row `best`, over the cases that both have, or nan."""
+    if best not in times.index:
+        return [math.nan] * len(times)
+    shared = times.notna() & times.loc[best].notna()
+    return [
+        compute_mean(own[both]) / compute_mean(times.loc[best][both]) if both.any() else math.nan
+        for (_, own), (_, both) in zip(times.iterrows(), shared.iterrows(), strict=True)
+    ]
 
 
 def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None = None) -> Frame:
     """Rank solvers by the number of cases that they bring to a tolerance, then by their mean time.
 
-    In the mean, a case that a solver does not solve or does not accept counts as the time limit, so that the means of
-    all solvers can be compared. Solvers with a contradicted claim come last. The first rows are within noise of the
-    best (`tie`), `auto` first.
+    A case without a solution is solved by a proof of this that the judge has checked (`select_answers`). The mean is
+    over the solved cases, so that it is comparable only between solvers that solve as many cases. Solvers with a
+    contradicted claim come last. The first rows are within noise of the best (`tie`), `auto` first.
 
     Parameters
     ----------
@@ -136,8 +154,10 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
     Returns
     -------
     DataFrame
-        By solver: `solved`, `tried` (accepted cases), `cases`, `mean` [s] over all cases, `worst` [s] of the solved
-        cases, `hardest` (case), `false` (number of false claims), `noise`, `tie` and `place`.
+        By solver: `solved`, `proven` (solved cases that have no solution), `tried` (accepted cases), `cases`, `mean`
+        [s] and `worst` [s] of the solved cases, `ratio` [-] of the mean to that of the first solver (not the engine's
+        own) on the cases that both solve, `hardest` (case), `false` (number of false claims), `noise`, `tie` and
+        `place`.
     """
     times = report.get_times(tolerance)
     names = list(times.columns) if cases is None else [case for case in cases if case in times]
@@ -149,11 +169,12 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
     ranking = pd.DataFrame(
         {
             "solved": times.notna().sum(axis=1),
+            "proven": times[times.columns.intersection(report.list_proven(tolerance))]
+            .notna()
+            .sum(axis=1),
             "tried": accepted.loc[times.index].sum(axis=1),
             "cases": len(names),
-            "mean": compute_mean(
-                times.clip(upper=report.time_limit).fillna(report.time_limit), axis=1
-            ),
+            "mean": compute_mean(times, axis=1),
             "worst": times.max(axis=1),
             "hardest": times.fillna(-1.0).idxmax(axis=1) if len(names) else "",
             "false": false["solver"]
@@ -179,7 +200,10 @@ def rank_solvers(report: Contents, tolerance: float, cases: Iterable[str] | None
         columns="liar"
     )
     is_first = ranking["tie"] & (ranking.index == PREFERRED_SOLVER)
-    return ranking.iloc[np.argsort(np.where(is_first, 0, np.where(tie, 1, 2)), kind="stable")]
+    order = np.argsort(np.where(is_first, 0, np.where(tie, 1, 2)), kind="stable")
+    ranking = ranking.iloc[order]
+    best = ranking.index[(ranking["solved"] > 0) & (ranking.index != ENGINE_NAME)]
+    return ranking.assign(ratio=compute_ratios(times.loc[ranking.index], *best[:1]))
 
 
 def is_plug_in(solver: str) -> bool:
@@ -436,13 +460,35 @@ class Contents:
         )
         return (2.0 * ratio).clip(MIN_NOISE, MAX_NOISE).fillna(MIN_NOISE)
 
+    @cached_property
+    def _proven(self) -> dict[str, float]:
+        """Smallest residual of all runs on each case of which a run has proven that it has no solution."""
+        cases = self.frame["case"][is_proof(self.frame)].astype(str).unique()
+        runs = self.frame[self.frame["case"].isin(cases)]
+        smallest = runs.groupby(runs["case"].astype(str))["relative"].min()
+        return {case: float(smallest[case]) for case in cases}
+
+    def list_proven(self, tolerance: float) -> list[str]:
+        """Return the cases that have a checked proof that no answer exists, and no answer to the tolerance.
+
+        A proof for 1e-9 does not exclude an answer to 1e-3. A proof for a looser tolerance holds for a tighter one.
+        """
+        return [case for case, smallest in self._proven.items() if not smallest <= tolerance]
+
+    def select_answers(self, runs: Frame, tolerance: float) -> Frame:
+        """Return the runs that solve their case to a tolerance.
+
+        They have this or a tighter tolerance and a judged residual within it, or a proof that the case has no solution
+        (`list_proven`).
+        """
+        reached = (runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)
+        return runs[reached | (is_proof(runs) & runs["case"].isin(self.list_proven(tolerance)))]
+
     def get_times(self, tolerance: float) -> Frame:
-        """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not reach it."""
+        """Return the time [s] of each solver (row) on each case (column) to a tolerance: nan if it did not solve it."""
         if tolerance not in self._times:
             runs = self.ranked_runs
-            reached = runs[(runs["tol"] <= tolerance) & (runs["relative"] <= tolerance)].fillna(
-                {"time": 0.0}
-            )
+            reached = self.select_answers(runs, tolerance).fillna({"time": 0.0})
             times = reached.groupby(["solver", "case"], observed=True)["time"].min().unstack()
             solvers = sorted(map(str, runs["solver"].unique()))
             cases = list(runs["case"].unique())
@@ -489,7 +535,7 @@ class Contents:
 
 
 def tabulate_solvers(report: Contents) -> Frame:
-    """Tabulate the solvers in their ranking: solved and accepted cases, and the mean time to each tolerance."""
+    """Tabulate the solvers in their ranking: solved and accepted cases, and the mean time of the solved ones."""
     ranking = rank_solvers(report, report.tolerance, report.subject)
     table = pd.DataFrame(
         {
@@ -501,8 +547,12 @@ def tabulate_solvers(report: Contents) -> Frame:
     )
     if not report.is_campaign:
         for tolerance in report.tolerances:
-            means = rank_solvers(report, tolerance, report.subject)["mean"].reindex(ranking.index)
-            table[f"to {format_tolerance(tolerance)} [s]"] = means.array
+            other = rank_solvers(report, tolerance, report.subject).reindex(ranking.index)
+            target = f"to {format_tolerance(tolerance)}"
+            if tolerance != report.tolerance:
+                table[f"solved {target}"] = other["solved"].fillna(0).astype(int).array
+            table[f"{target} [s]"] = other["mean"].array
+        table["× best"] = [float(f"{x:.3g}") for x in ranking["ratio"]]
         table["slowest [s]"] = ranking["worst"].array
         table["tie"] = ranking["tie"].array
     return table.assign(**{"false claims": ranking["false"].array})
@@ -535,9 +585,7 @@ def tabulate_runs(report: Contents) -> Frame:
     table.columns = ["smallest residual [-]", "velocity error [m/s]", "floor [-]"]
     for tolerance in () if report.is_campaign else report.tolerances:
         target = f"to {format_tolerance(tolerance)}"
-        reached = to_tolerance[
-            to_tolerance[["tol", "relative"]].max(axis=1) <= tolerance
-        ].sort_values("time")
+        reached = report.select_answers(to_tolerance, tolerance).sort_values("time")
         first = reached.drop_duplicates(keys).set_index(keys).reindex(table.index)
         table.insert(table.shape[1] - 3, f"{target} [s]", first["time"])
         table.insert(table.shape[1] - 3, f"{target}, median [s]", first["time_median"])
@@ -563,8 +611,7 @@ def select_failures(report: Contents) -> Frame:
     """Return runs that missed their tolerance above the round-off floor, that died, and false claims."""
     f = report.frame
     floor = [at_floor(x, y) for x, y in zip(f["relative"], f["roundoff_floor"], strict=True)]
-    proven = (f["status"] == "INFEASIBLE") & (f["claim_check"] == CONFIRMED)
-    missed = (f["mode"] == "tol") & ~f["success"] & ~np.array(floor, bool) & ~proven
+    missed = (f["mode"] == "tol") & ~f["success"] & ~np.array(floor, bool) & ~is_proof(f)
     died = ~np.isfinite(f["relative"]) | f["status"].astype(str).str.startswith(DEATHS)
     return f[missed | died | (f["claim_check"] == CONTRADICTED)]
 
@@ -577,6 +624,7 @@ def tabulate_structures(report: Contents) -> Frame:
     """
     rows = []
     runs = select_starts(report.frame)
+    runs = runs.assign(relative=runs["relative"].where(~is_proof(runs), 0.0))
     for name, cases in report.structures.items():
         row: Row = {"structure": name, "cases": len(cases)}
         sizes = report.cases.loc[cases, "rows"]
@@ -722,12 +770,13 @@ def tabulate_changes(report: Contents) -> Frame:
     assert report.earlier is not None
     frames = Contents(report.earlier).newest, report.frame[report.frame["step"] < 0]
     some = [f[f["mode"] == "tol"].astype(dict.fromkeys(keys[:4], str)) for f in frames]
+    some = [f.assign(solved=(f["relative"] <= f["tol"]) | is_proof(f)) for f in some]
     both = pd.merge(*some, on=keys)
     drift = both.groupby("case")[["calibration_time_x", "calibration_time_y"]].median()
     drift = (drift["calibration_time_y"] / drift["calibration_time_x"]).fillna(1.0)
     for r in both.itertuples():
-        before = r.time_x * drift[r.case] if r.relative_x <= r.tol else math.inf
-        after = r.time_y if r.relative_y <= r.tol else math.inf
+        before = r.time_x * drift[r.case] if r.solved_x else math.inf
+        after = r.time_y if r.solved_y else math.inf
         spread = 2.0 * (max(r.time_median_x / r.time_x, r.time_median_y / r.time_y) - 1.0)
         noise = 1.0 + max(MAX_NOISE, spread if math.isfinite(spread) else 0.0)
         if before != after and not before / noise <= after <= before * noise:

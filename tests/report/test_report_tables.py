@@ -382,21 +382,46 @@ def test_report_without_times_ranks_by_solved_cases_and_shows_no_time():
     assert "[s]" not in ",".join(report.sections["solvers"].frame)
 
 
-def test_rank_solvers_counts_unsolved_and_refused_cases_as_the_time_limit():
-    """Geometric mean, shifted by 10 µs, of 1 ms and the limit of 2 s."""
-    made = [
-        *all_of("ab", ("all", 4e-2)),
-        *all_of("a", ("some", 1e-3), ("few", 1e-3)),
-        record("b", "some", 1.0, 0.5),
-    ]
+def test_mean_time_is_of_the_solved_cases_and_ratio_of_the_shared_ones():
+    """The mean of one case is its time, however many others are not solved or not accepted."""
+    made = [*all_of("a", ("all", 2e-3)), *all_of("b", ("all", 4e-2)), record("b", "some", 1.0, 0.5)]
+    made += all_of("a", ("some", 1e-3), ("few", 1e-3))
     ranking = tables.rank_solvers(report_of(*made), 1e-6)
-    expected = math.sqrt((1e-3 + 1e-5) * (2.0 + 1e-5)) - 1e-5
-    assert ranking.loc[["some", "few"], "mean"].to_numpy() == pytest.approx(expected)
+    assert ranking.loc[["some", "few"], "mean"].to_numpy() == pytest.approx(1e-3)
+    assert ranking.loc[["some", "few"], "ratio"].to_numpy() == pytest.approx(
+        1.01e-3 / 2.01e-3, rel=0.01
+    )
     assert ranking[["solved", "tried"]].to_dict("index") == {
         "all": {"solved": 2, "tried": 2},
         "some": {"solved": 1, "tried": 2},
         "few": {"solved": 1, "tried": 1},
     }
+
+
+@pytest.mark.parametrize("status", ["INFEASIBLE", "UNBOUNDED"])
+def test_checked_proof_is_the_answer_of_a_case_without_a_solution(status):
+    unproven = {"status": status, "claim_check": "not proven"}
+    made = [
+        *all_of("ab", ("auto", 2e-3), ("pgs", 1e-3), ("guess", 1e-3)),
+        record("none", "auto", 6e-5, 1.0, tol=1e-3, status=status),
+        record("none", "pgs", 5e-1, 1.0, status="DIVERGED"),
+        record("none", "guess", 1e-5, 1.0, **unproven),
+    ]
+    report = report_of(*made)
+    ranking = report.ranking
+    assert ranking["solved"].to_dict() == {"auto": 3, "pgs": 2, "guess": 2}
+    assert ranking["proven"].to_dict() == {"auto": 1, "pgs": 0, "guess": 0}
+    assert ranking.at["auto", "mean"] <= ranking.at["auto", "worst"] == 2e-3
+    assert "solves all 3 problems (1 by a proof that it has no solution)" in report.verdict
+    misses = next(text for text in report.sentences if text.startswith("Not solved"))
+    assert "by pgs" in misses and "by guess" in misses and "auto" not in misses
+    assert not report.alarms and report.get_times(1e-6).at["auto", "none"] == 6e-5
+    # An answer to 1e-3 exists: the proof for 1e-6 is none of it.
+    near = report_of(*made[:-2], record("none", "pgs", 1.0, 5e-4, tol=1e-3))
+    assert (
+        math.isnan(near.get_times(1e-3).at["auto", "none"])
+        and near.get_times(1e-6).at["auto", "none"] == 6e-5
+    )
 
 
 @pytest.mark.parametrize(
