@@ -494,3 +494,87 @@ def nearly_singular(seed):
         jac[rng.random(jac.shape) < 0.5] = 0.0
     friction = "cone" if law == "cone" else "coulomb"
     return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, friction=friction)
+
+
+# -- few rows ---------------------------------------------------------------------------------------
+
+
+def draw_few_rows(kind, seed):
+    """Draw a problem that a compiled call may solve at once, of one of the kinds `FEW_ROWS`."""
+    rng = np.random.default_rng(seed)
+    if kind == "lcp":
+        return random_lcp(seed, m=int(rng.integers(1, 64)), rank=None if rng.random() < 0.7 else 3)
+    if kind == "linear":
+        g = rng.normal(size=(9, 9))
+        a = g @ g.T if rng.random() < 0.6 else g
+        return lv.Problem.linear(a, rng.normal(size=9))
+    if kind == "singular":
+        g = rng.normal(size=(9, 9 - seed % 4)) * 10.0 ** rng.uniform(0.0, seed % 3, (9, 1))
+        a = g @ g.T
+        return lv.Problem.linear(
+            0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9)
+        )
+    if kind == "one-sided":  # unsymmetric
+        return lv.Problem.lcp(
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
+            rng.normal(size=6),
+            friction=["coulomb", "cone"][seed % 2],
+        )
+    if kind.startswith("rows"):
+        return random_contact_problem(
+            seed,
+            kind.split()[1],
+            bodies=3,
+            joints=int(rng.integers(0, 3)),
+            contacts=int(rng.integers(0, 5)),
+        )
+    if kind.startswith("matrix"):
+        return as_matrix(draw_few_rows("rows " + kind.split()[1], seed))
+    law = kind.split()[1]
+    if kind.startswith("hollow"):
+        return hollow(random_generalized_problem(seed, law, n=8, compliance=seed % 3 > 0), rng)
+    tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
+    return random_generalized_problem(
+        seed,
+        law,
+        n=int(rng.integers(2, 12)),
+        compliance=seed % 3 > 0,
+        contacts=4,
+        tangents=tangents,
+    )
+
+
+def hollow(problem, rng):
+    """Return the problem with some rows of J, and the compliance of these, all zero: no impulse moves them."""
+    general = problem.generalized
+    soft = problem.compliance.copy()
+    jac = general.jac.toarray()
+    rows = rng.random(problem.m) < 0.3
+    jac[rows] = soft[rows] = 0.0
+    target = np.where(rows, rng.choice([-1.0, -1e-3, 0.0, 0.2], problem.m), problem.b)
+    return lv.Problem.from_jacobian(
+        jac,
+        general.mass,
+        general.v_free,
+        target=target + jac @ general.v_free,
+        cones=problem.cones,
+        compliance=soft,
+        friction=problem.friction,
+    )
+
+
+#: Kinds of `draw_few_rows`.
+FEW_ROWS = (
+    "lcp",
+    "linear",
+    "singular",
+    "one-sided",
+    "rows coulomb",
+    "rows cone",
+    "matrix coulomb",
+    "matrix cone",
+    "general coulomb",
+    "general cone",
+    "hollow coulomb",
+    "hollow cone",
+)

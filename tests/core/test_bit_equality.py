@@ -1,28 +1,23 @@
-"""Two ways to compute one result give the same bits. Each pair is compared here once.
+"""A run in parts has the bits of the whole run: `RUNS`.
 
-`WAYS` compares ways to solve with a fresh solve, `RUNS` a run in parts with the whole run. Other pairs: prepared
-solvers in test_sequences.py and the contract; batches and single solves in test_many.py; packed sweeps in
-test_packed.py; orders of blocks in test_sweeps_large.py; the compiled call of small problems in test_small.py; lanes
-of factors in test_newton.py and test_sparse_factor.py; the C library in tests/export/test_same_bits.py; the engine in
-tests/sim/engine/test_engine_bits.py.
+Other pairs that are compared bit by bit: every way to solve and judge, single, prepared and in batches, in
+test_another_way.py; sequences of calls of prepared solvers in test_sequences.py; packed sweeps in test_packed.py;
+orders of blocks in test_sweeps_large.py; lanes of factors in test_newton.py and test_sparse_factor.py; the C library
+in tests/export/test_same_bits.py; the engine in tests/sim/engine/test_engine_bits.py.
 """
 
 import functools
 import itertools
-import pickle
-import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from calls import driven, facts
+from calls import driven
 from enumeration import random_bounds
 from random_problems import as_matrix, make_problems_of_every_kind, touching
 
 import lavender as lv
-from benchmarks.core_problems import fresh, stacks
+from benchmarks.core_problems import stacks
 from lavender import registry
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.solvers.newton_systems import general
@@ -41,86 +36,6 @@ def examples():
     """Problems of every law and kind of block, each in every form."""
     kinds = make_problems_of_every_kind().items()
     return [p for (_, kind), (forms, _) in kinds if not kind.startswith("round") for p in forms]
-
-
-def at_once(function, n=8):
-    """Results of n threads that begin together."""
-    gate = threading.Barrier(n)
-
-    def run():
-        gate.wait(600)
-        return function()
-
-    with ThreadPoolExecutor(n) as pool:
-        return [future.result() for future in [pool.submit(run) for _ in range(n)]]
-
-
-def solve_in_eight_threads(problem, name, **options):
-    """Each property that is derived from the problem is computed by the thread that reads it first."""
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        first, *others = at_once(lambda: lv.solve(problem, name, **options))
-    finally:
-        sys.setswitchinterval(interval)
-    assert all(facts(other) == facts(first) for other in others)
-    return first
-
-
-def solve_with_a_callback(problem, name, **options):
-    if not registry.get(name).callback:
-        return lv.solve(problem, name, **options)
-    return lv.solve(problem, name, callback=lambda *_: None, **options)
-
-
-def solve_after_a_residual(problem, name, **options):
-    lv.residual(problem, np.ones(problem.m))
-    return lv.solve(problem, name, **options)
-
-
-#: Ways to solve a problem of which nothing was derived before.
-WAYS = {
-    "a pickled problem": lambda p, name, **more: lv.solve(
-        pickle.loads(pickle.dumps(p)), name, **more
-    ),
-    "judged before": solve_after_a_residual,
-    "one of a list": lambda p, name, **more: lv.solve_many([p], name, **more)[0],
-    "a list and two threads": lambda p, name, **more: lv.solve_many(
-        [p] * 3, name, threads=2, **more
-    )[2],
-    "eight threads": solve_in_eight_threads,
-    "a time limit that does not bind": lambda p, name, **more: lv.solve(
-        p, name, time_limit=600.0, **more
-    ),
-    "a list and a time limit": lambda p, name, **more: lv.solve_many(
-        [p], name, time_limit=600.0, **more
-    )[0],
-    "a callback": solve_with_a_callback,
-}
-
-
-@functools.cache
-def solved(name):
-    """(problem, options, facts of its fresh solve) of each example that the solver accepts."""
-    options = {"tol": 1e-7, "max_iter": 60 if registry.get(name).resumable else None}
-    accepted = [p for p in examples() if registry.get(name).refuses(p) is None]
-    return [(p, options, facts(lv.solve(fresh(p), name, **options))) for p in accepted]
-
-
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("name", SOLVERS)
-def test_solve_in_another_way_has_the_bits_of_a_fresh_solve(name, way):
-    chosen = solved(name)[:9] if way == "eight threads" else solved(name)
-    for problem, options, expected in chosen:
-        assert facts(WAYS[way](fresh(problem), name, **options)) == expected, problem
-
-
-@pytest.mark.parametrize("name", SOLVERS)
-def test_prepared_solve_from_a_start_has_the_bits_of_a_fresh_solve(name):
-    for problem, options, _ in solved(name):
-        options = options | {"impulse": 10.0 * np.ones(problem.m)}
-        expected = facts(lv.solve(fresh(problem), name, **options))
-        assert facts(lv.prepare(fresh(problem), name).solve(**options)) == expected, problem
 
 
 def run_solver(problem, sizes, name, tol=1e-9, budget=1000, **options):
