@@ -48,6 +48,36 @@ def facts(solution):
     return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
 
 
+#: Name of each array of `Solutions` and `Residuals` -> the same number of a single solution and residual.
+SINGLE = {
+    "status": lambda s, r: s.status, "success": lambda s, r: s.success, "iterations": lambda s, r: s.iterations,
+    "verdict": lambda s, r: r.verdict, "excess": lambda s, r: r.excess, "relative": lambda s, r: r.relative,
+    "energy": lambda s, r: r.energy, "velocity_error": lambda s, r: r.velocity,
+    "roundoff_floor": lambda s, r: r.roundoff_floor, "worst_row": lambda s, r: r.worst_row,
+    "energy_at_zero": lambda s, r: r.energy_at_zero, "velocity_at_zero": lambda s, r: r.velocity_at_zero,
+    "impulse_error": lambda s, r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
+}  # fmt: skip
+
+
+def list_arrays(results):
+    """Return the public attributes that are arrays with a number of each world."""
+    names = [
+        name
+        for name in dir(results)
+        if not name.startswith("_") and name not in ("impulse", "velocity")
+    ]
+    found = {
+        name for name in names if getattr(getattr(results, name), "shape", None) == (len(results),)
+    }
+    assert found <= SINGLE.keys() and {"relative", "energy", "worst_row", "roundoff_floor"} <= found
+    return found
+
+
+def is_same(x, y):
+    """Return whether two numbers or words are equal, or both are NaN."""
+    return x == y or (x != x and y != y)
+
+
 def check(problem, solver, **options):
     short = lv.solve(problem, solver, **options)
     expected = facts(long_way(problem, solver, **options))

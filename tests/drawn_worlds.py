@@ -16,7 +16,7 @@ import lavender as lv
 
 AXES = {
     "mass_unit": (2.0**-30, 1.0, 2.0**30),
-    "condition": (1.0, 1e3, 1e7, 1e11),
+    "condition": ((0.0, 2.0), (2.0, 6.0), (6.0, 9.0), (9.0, 11.5)),  # Powers of 10.
     "structure": ("full M", "tree", "zeros of M"),
     "coupling": ("one island", "one island", "two islands", "an empty row"),
     "size": ("fewer rows than velocities", "as many", "more"),
@@ -81,25 +81,36 @@ def draw_mass(rng, nv, structure, condition):
     return mass
 
 
-def draw_blocks(rng, m, law):
-    """Draw which rows are normals of contacts: bounded rows before, behind, on both sides of contacts, or alone."""
-    contacts = int(rng.integers(0, m // 3 + 1)) if law != "lcp" else 0
-    before = int(rng.choice([0, m - 3 * contacts, (m - 3 * contacts) // 2]))
-    return before, contacts, m - 3 * contacts - before
+def draw_blocks(rng, law):
+    """Draw a function of the number of rows: rows before contacts, contacts, and rows behind them.
+
+    Worlds of one function share groups of lanes.
+    """
+    share = 0.0 if law == "lcp" else float(rng.choice([0.5, 1.0]))
+    place = float(rng.choice([0.0, 0.5, 1.0]))
+
+    def divide(m):
+        contacts = round(share * (m // 3))
+        before = round(place * (m - 3 * contacts))
+        return before, contacts, m - 3 * contacts - before
+
+    return divide
 
 
-def draw_world(rng, choice, nv, law, precision=("f8", "f8", "f8")):
+def draw_world(rng, choice, nv, law, precision, divide):
     """Draw the arrays of a combination with nv velocities."""
     unit = choice["mass_unit"]
-    m = {"fewer rows than velocities": max(1, nv // 2), "as many": nv, "more": nv + 5}[
+    m = {"fewer rows than velocities": max(1, nv // 2), "as many": nv, "more": nv + 3}[
         choice["size"]
     ]
-    before, contacts, behind = draw_blocks(rng, m, law)
+    before, contacts, behind = divide(m)
     normals = before + 3 * np.arange(contacts)
     is_bounded = np.ones(m, bool)
     is_bounded[before : before + 3 * contacts] = False
     # Rounded to float32, M of a larger condition number need not be positive definite.
-    condition = min(choice["condition"], 1e4) if precision[1] == "f4" else choice["condition"]
+    condition = 10.0 ** min(
+        rng.uniform(*choice["condition"]), 4.0 if precision[1] == "f4" else 12.0
+    )
     mass = draw_mass(rng, nv, choice["structure"], condition)
     jac = rng.standard_normal((m, nv)) * (rng.random((m, nv)) < 0.7)
     jac[:, int(rng.integers(0, nv))] += 0.5  # Couples all rows.
@@ -169,7 +180,8 @@ def draw_worlds(seed, n, law, nv=None, precision=None):
     precision = (
         PRECISIONS[int(rng.integers(0, len(PRECISIONS)))] if precision is None else precision
     )
-    return [draw_world(rng, choice, nv, law, precision) for choice in draw_choices(rng, n)]
+    divide = draw_blocks(rng, law)
+    return [draw_world(rng, choice, nv, law, precision, divide) for choice in draw_choices(rng, n)]
 
 
 def lay_out(worlds, layout="rows"):

@@ -273,7 +273,7 @@ class Residual:
         """Error of each island, in the order of their first blocks."""
         problem = self._problem.disk
         get_zero_impulse_reference(problem)
-        label, table = measure.residuals_by_island(problem.metric, self._impulse)
+        label, table = measure.residuals_by_island(problem.metric, self._impulse, TOL)
         return Islands(label, *table.T)
 
     def __repr__(self) -> str:

@@ -374,10 +374,11 @@ def store_zero_impulse_residual(Data p, const double[::1] velocity=None):
     return start
 
 
-def residuals_by_island(Data p, const double[::1] lam):
+def residuals_by_island(Data p, const double[::1] lam, double tol=INFINITY):
     """Return the islands of the blocks (k,) and a table (n, 5) of an impulse (m,) [N s], with one row per island.
 
     Columns: relative residual, E [sqrt J], V [m/s], E0 [sqrt J], V0 [m/s] of judge/score.pxd; E0 and V0 are -1 if no row acts.
+    With a finite tol they are the numbers that are reported, with floors and refined for tol.
     """
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.get_pointers()
@@ -385,6 +386,7 @@ def residuals_by_island(Data p, const double[::1] lam):
     cdef int32_t i, a, n = s.n if s != NULL else 1
     cdef score_t score = make_empty_score()
     cdef tally_t t
+    cdef double now
     cdef double[::1] w = np.empty(2 * m + 2 * n + count_judge_scratch(&v) + 1)
     label_, table_ = np.zeros(p.blocks.n_blocks, np.int32), np.zeros((n, 5))
     cdef int32_t[::1] label = label_
@@ -392,7 +394,11 @@ def residuals_by_island(Data p, const double[::1] lam):
     if m == 0:
         return label_, table_[:0]
     score.by_island = &w[2 * m]
-    judge_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], False, &score)
+    judge_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], tol < INFINITY, &score)
+    if tol < INFINITY:
+        now = relative_residual_of_score(&score, &w[0], m, p.reference_energy, p.reference_velocity)
+        refine_reported_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], p.reference_energy, p.reference_velocity, tol, now,
+                             &score)
     if s == NULL:
         table[0, 0] = relative_residual_of_score(&score, &w[0], m, p.reference_energy, p.reference_velocity)
         table[0, 1], table[0, 2] = score.energy, score.velocity

@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from calls import SHORT, facts
+from calls import SHORT, SINGLE, facts, is_same, list_arrays
 from drawn_worlds import LAYOUTS, draw_worlds, lay_out
 from random_problems import FEW_ROWS, draw_few_rows, make_problems_of_every_kind
 
@@ -31,8 +31,8 @@ from lavender.batch.data import Batch
 
 SOLVERS = lv.available(external=False)
 LAWS = ("lcp", "coulomb", "cone")
-SEEDS = range(18)
-STARTS = ("none", "near", "far")
+SEEDS = range(48)
+STARTS = ("none", "none", "near", "far")
 
 
 # -- problems ----------------------------------------------------------------------------------------------------------
@@ -74,11 +74,11 @@ def list_calls(name):
 def draw_group(seed):
     """Return (worlds of one batch, options, starts or None): the law, options and kind of start go with the seed."""
     worlds = draw_worlds(seed, 16, LAWS[seed % 3])
-    rng, start = np.random.default_rng(seed + 1), STARTS[seed // 3 % 3]
+    rng, start = np.random.default_rng(seed + 1), STARTS[seed // 3 % 4]
     solved = [lv.solve(w.make_problem(), tol=1e-6).impulse for w in worlds]
     factor = 1e-3 if start == "near" else 1e5
     starts = [x + factor * np.abs(x).max(initial=0.0) * rng.standard_normal(len(x)) for x in solved]
-    return worlds, {"tol": (1e-7, 1e-12)[seed // 9 % 2]}, None if start == "none" else starts
+    return worlds, {"tol": (1e-6, 1e-9, 1e-12)[seed % 7 % 3]}, None if start == "none" else starts
 
 
 def pair(worlds, starts):
@@ -204,32 +204,6 @@ def solve_batch(worlds, starts, layout, width=None, order=1, **options):
     return [many[i] for i in range(len(worlds))][::order]
 
 
-#: Name of each array of `Solutions` and `Residuals` -> the same number of a single solution and residual.
-SINGLE = {
-    "status": lambda s, r: s.status, "success": lambda s, r: s.success, "iterations": lambda s, r: s.iterations,
-    "verdict": lambda s, r: r.verdict, "excess": lambda s, r: r.excess, "relative": lambda s, r: r.relative,
-    "energy": lambda s, r: r.energy, "velocity_error": lambda s, r: r.velocity,
-    "roundoff_floor": lambda s, r: r.roundoff_floor, "worst_row": lambda s, r: r.worst_row,
-    "energy_at_zero": lambda s, r: r.energy_at_zero, "velocity_at_zero": lambda s, r: r.velocity_at_zero,
-    "impulse_error": lambda s, r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
-}  # fmt: skip
-
-
-def list_arrays(results):
-    """Return the public attributes that are arrays with a number of each world."""
-    names = [name for name in dir(results) if not name.startswith("_")]
-    found = {
-        name for name in names if getattr(getattr(results, name), "shape", None) == (len(results),)
-    }
-    assert found <= SINGLE.keys() and {"relative", "energy", "worst_row", "roundoff_floor"} <= found
-    return found
-
-
-def is_same(x, y):
-    """Return whether two numbers or words are equal, or both are NaN."""
-    return x == y or (x != x and y != y)
-
-
 def check_arrays(many, batch):
     """Every array of a batch has the numbers of its solutions; impulses and velocities have their bits."""
     for name in list_arrays(many):
@@ -269,12 +243,12 @@ def solve_each(worlds, starts, way, **options):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_drawn_worlds_in_another_way_have_the_bits_of_fresh_solves(seed):
     worlds, options, starts = draw_group(seed)
-    some = {
+    each = {
         name: functools.partial(solve_each, way=WAYS[name])
         for name in WAYS
         if "threads" not in name
     }
-    for way, solve in (BATCHES | some).items():
+    for way, solve in list((BATCHES | each).items())[seed % 4 :: 4]:
         found = solve(worlds, starts, **options)
         for i, (solution, expected) in enumerate(zip(found, expect(seed), strict=True)):
             assert facts(solution) == expected, (way, i, worlds[i].choice)
@@ -308,6 +282,9 @@ def test_judged_batch_has_the_bits_of_single_residuals(seed):
                     worlds[i].choice,
                 )
             assert list_words(found[i]) == list_words(one), worlds[i].choice
+            assert precision is not None or is_same(
+                one.islands.relative.max(initial=0.0), one.relative
+            )
 
 
 def list_words(residual):
@@ -331,7 +308,7 @@ pickle.dump(found, open(sys.argv[3], "wb"))
 def test_another_process_has_the_bits_of_this_one(tmp_path):
     calls = [(fresh(p), name, o) for name in SOLVERS for p, o, _ in list_calls(name)[::7]]
     expected = [e for name in SOLVERS for *_, e in list_calls(name)[::7]]
-    for seed in SEEDS:
+    for seed in SEEDS[::4]:
         worlds, options, starts = draw_group(seed)
         calls += [
             (w.make_problem(), "auto", options | {"impulse": x}) for w, x in pair(worlds, starts)

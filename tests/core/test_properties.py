@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from calls import installed
+from calls import SINGLE, installed, list_arrays
 from random_problems import (
     CONTACTS,
     add_compliance,
@@ -67,34 +67,6 @@ def draw_worlds(kind):
     return list(batch) if kind == "problems" else batch
 
 
-#: Name of each array of `Solutions` and `Residuals` to the same number of a single result.
-SINGLE = {
-    "status": lambda s, r: s.status,
-    "success": lambda s, r: s.success,
-    "iterations": lambda s, r: s.iterations,
-    "verdict": lambda s, r: r.verdict,
-    "excess": lambda s, r: r.excess,
-    "relative": lambda s, r: r.relative,
-    "energy": lambda s, r: r.energy,
-    "velocity_error": lambda s, r: r.velocity,
-    "roundoff_floor": lambda s, r: r.roundoff_floor,
-    "worst_row": lambda s, r: r.worst_row,
-    "energy_at_zero": lambda s, r: r.energy_at_zero,
-    "velocity_at_zero": lambda s, r: r.velocity_at_zero,
-    "impulse_error": lambda s, r: abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0,
-}
-
-
-def list_arrays(results):
-    """Return the public attributes that are arrays with a number of each world."""
-    names = [name for name in dir(results) if not name.startswith("_")]
-    found = {
-        name for name in names if getattr(getattr(results, name), "shape", None) == (len(results),)
-    }
-    assert found <= SINGLE.keys() and {"relative", "energy", "worst_row", "roundoff_floor"} <= found
-    return found
-
-
 @pytest.mark.parametrize(
     "more", [{}, {"velocity_tol": 1e-3, "max_iter": 2}, {"max_iter": 1, "tol": 1e-12}]
 )
@@ -116,16 +88,6 @@ def test_solve_many_arrays_equal_the_numbers_of_single_solutions(kind, solver, m
             [p.velocity(s.impulse).ravel() for p, s in zip(worlds, many, strict=True)]
         )
         np.testing.assert_allclose(many.velocity.ravel(), velocity, rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", WORLDS)
-def test_residual_many_arrays_equal_the_numbers_of_single_residuals(kind):
-    worlds = draw_worlds(kind)
-    starts = [0.9 * s.impulse for s in lv.solve_many(worlds)]
-    found = lv.residual_many(worlds, np.array(starts) if isinstance(worlds, lv.Batch) else starts)
-    judged = [lv.residual(p, x) for p, x in zip(worlds, starts, strict=True)]
-    for name in list_arrays(found):
-        assert getattr(found, name).tolist() == [SINGLE[name](None, r) for r in judged], name
 
 
 def test_velocity_tol_accepts_what_is_within_it_from_every_end_that_claims_nothing_else():
