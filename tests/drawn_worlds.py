@@ -17,7 +17,7 @@ import lavender as lv
 AXES = {
     "mass_unit": (2.0**-30, 1.0, 2.0**30),
     "condition": ((0.0, 2.0), (2.0, 6.0), (6.0, 9.0), (9.0, 11.5)),  # Powers of 10.
-    "structure": ("full M", "tree", "zeros of M"),
+    "structure": ("full M", "tree", "zeros of M", "one coupling"),
     "coupling": ("one island", "one island", "two islands", "an empty row"),
     "size": ("fewer rows than velocities", "as many", "more"),
     "softness": ("rigid", "soft", "both"),
@@ -67,13 +67,19 @@ def draw_choices(rng, n):
 
 
 def draw_mass(rng, nv, structure, condition):
-    """Draw M (nv, nv) in kg: full with a condition number, over a tree, or with zeros that its factor passes over."""
+    """Draw M (nv, nv) in kg: full, over a tree, or with zeros that its factor passes over, other ones in each world."""
     if structure == "tree":
         mass = tree_mass(rng, random_tree_parents(rng, nv))
         size = np.geomspace(
             1.0, condition**0.25, nv
         )  # Unequal links; the scaled M keeps its condition.
         return size[:, None] * mass * size
+    if structure == "one coupling":
+        mass = np.diag(np.geomspace(1.0, condition, nv)[rng.permutation(nv)])
+        column = int(rng.integers(0, max(nv - 1, 1)))
+        if nv > 1:
+            mass[-1, column] = mass[column, -1] = 0.5 * np.sqrt(mass[-1, -1] * mass[column, column])
+        return mass
     mass = conditioned(rng, nv, condition)
     if structure == "zeros of M":
         cut = int(rng.integers(1, nv)) if nv > 1 else 1

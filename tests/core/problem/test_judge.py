@@ -3,6 +3,7 @@
 import judge_twin
 import numpy as np
 import pytest
+from drawn_worlds import draw_worlds
 from hypothesis import given
 from hypothesis import strategies as st
 from judge_twin import spec_of
@@ -69,6 +70,42 @@ def test_the_judge_equals_its_twin_on_round_cones(seed, tangents, soft):
     lam = np.random.default_rng(seed).normal(size=problem.m)
     for p in (problem, as_matrix(problem)):
         equals_the_twin(p, lam)
+
+
+@pytest.mark.parametrize("seed", range(18))
+def test_the_judge_equals_its_twin_in_all_units_and_ranges(seed):
+    """Random impulses, none, a solution and one near it; the references of problems at rest are in these residuals."""
+    rng = np.random.default_rng(seed)
+    for world in draw_worlds(
+        seed, 8, ("lcp", "coulomb", "cone")[seed % 3], precision=("f8", "f8", "f8")
+    ):
+        problem = world.make_problem()
+        twin = judge_twin.Problem(spec_of(problem))
+        solved = lv.solve(problem, tol=1e-9).impulse
+        near = solved * (1.0 + 1e-5 * rng.normal(size=problem.m))
+        # At b = 0, page and judge differ on impulses beyond the bounds of rows that no impulse moves.
+        anywhere = np.where(
+            world.jac.any(axis=1), rng.normal(size=problem.m) / problem.d, problem.start()
+        )
+        for lam in (anywhere, problem.start(), solved, near):
+            found = lv.residual(problem, lam, tol=0.0)
+            said = twin.judge(lam)
+            if said.nothing:  # Near the line below which the terms of b stand in.
+                continue
+            first = min(said.unrefined, 0.1 * said.relative)
+            if (
+                found.relative != said.relative
+            ):  # Both are infinite if a row at rest without terms is moved.
+                assert (
+                    abs(found.relative - said.relative)
+                    <= 1e-9 * said.relative + said.allowed + first
+                ), world.choice
+            if found.relative == 0.0:  # Of any island.
+                continue
+            # Not 100 times below the twin's floor, nor above what the condition of M explains.
+            at = int(np.argmax(said.relatives))
+            assert said.floors[at] <= 100.0 * found.roundoff_floor, world.choice
+            assert 0.1 * found.roundoff_floor <= said.floors_most[at], world.choice
 
 
 def error_of_the_pass(problem, lam):
