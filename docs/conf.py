@@ -26,7 +26,15 @@ author = "The lavender developers"
 copyright = "The lavender developers, BSD 3-Clause licence"
 version = release = lavender.__version__
 
-extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser", "sphinx_copybutton"]
+extensions = [
+    "sphinx.ext.autodoc",
+    "numpydoc",
+    "myst_parser",
+    "sphinx_copybutton",
+    "sphinx_reredirects",
+]
+#: Former addresses of pages.
+redirects = {"chapter": "course/chapter.html", "chapter-answers": "course/answers.html"}
 exclude_patterns = ["_build"]
 default_role = "code"
 
@@ -62,7 +70,7 @@ CONTENTS = {
     "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
     "Judge engines": "audit mujoco worlds engines report commands scorecard",
-    "LavenderSim and the course": "engine chapter chapter-answers generated/examples",
+    "LavenderSim and the course": "engine course/chapter course/answers generated/examples",
     "Background": "residual methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
     "Project": "plugin architecture generated/api",
 }

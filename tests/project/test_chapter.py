@@ -25,7 +25,7 @@ from worked import example
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-PAGES = [ROOT / "docs" / f"chapter{part}.md" for part in ("", "-answers")]
+PAGES = [ROOT / "docs" / "course" / f"{name}.md" for name in ("chapter", "answers")]
 PAGE = "\n".join(path.read_text(encoding="utf-8") for path in PAGES)
 COMMENT = re.compile(r"<!-- (.*?) ?-->", re.DOTALL)
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
@@ -137,19 +137,24 @@ def test_chapter_panel_is_drawn_by_the_command_of_its_example():
     """Its picture is there without a build, and none is there that the page does not show."""
     pictures = ROOT / "docs" / "static" / "chapter"
     shown = re.findall(
-        r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE
+        r"\(\.\./static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`",
+        PAGE,
     )
     assert sorted(f"{file}.png" for file, *_ in shown) == sorted(
         path.name for path in pictures.iterdir()
     )
-    assert len(shown) > 12 and PAGE.count("(static/chapter/") == len(shown)
+    assert len(shown) > 12 and PAGE.count("(../static/chapter/") == len(shown)
     for file, name, panel in shown:
         assert file == panel and panel in example(name).PANELS
         assert (pictures / f"{file}.png").stat().st_size <= 150_000
     for name, panel in re.findall(r"`python examples/(\w+)\.py (\w+)\.png`", PAGE):
         assert panel in example(name).PANELS
-    other = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
-    assert set(re.findall(r"\(static/chapter/(\w+)\.png\)", other)) == {file for file, *_ in shown}
+    other = "".join(
+        path.read_text(encoding="utf-8") for path in [*(ROOT / "docs").glob("*.md"), *PAGES]
+    )
+    assert set(re.findall(r"\((?:\.\./)?static/chapter/(\w+)\.png\)", other)) == {
+        file for file, *_ in shown
+    }
     for name, panel in re.findall(r"generated/figures/(\w+)/(\w+)\.svg", other):
         assert panel in example(name).PANELS
     named = {re.match(r"python examples/(\w+)\.py", command) for command in CLAIMS}

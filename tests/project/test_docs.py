@@ -20,7 +20,11 @@ import lavender as lv
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "course").glob("*.md")),
+]
 BLOCK = re.compile(r"^( *)```(python|pycon|sh|console)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
@@ -84,9 +88,7 @@ def files(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if not page.stem.startswith("chapter")],
-    ids=lambda page: page.name,
+    "page", [page for page in PAGES if page.parent.name != "course"], ids=lambda page: page.name
 )
 def test_python_of_a_page_runs(page, files, capsys):
     whole = "".join(text for *_, text in blocks(page, "python", "pycon"))

@@ -21,9 +21,9 @@ from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, compute_ar
 #: ("measure"): "displacement" (largest distance of a body from its initial position, sideways or downwards), "gap"
 #: (largest distance between the ends of a joint), "apart" (largest distance of a body of B from the same body of A).
 #: A preset is a button with two settings of a scene side by side; "name" is its part of the page's address. The page
-#: opens with the first preset. The presets with numbers are the five experiments of docs/chapter.md; its links open
-#: them. A number is a line above the pictures: the medians of a solver value ("field") of A and B over steps first + 1
-#: to last, or if both are 0 the value of the first substep, and their ratio A/B ("AB"), B/A ("BA") or none ("").
+#: opens with the first preset. The presets with numbers are the five experiments of docs/course/chapter.md; its links
+#: open them. A number is a line above the pictures: the medians of a solver value ("field") of A and B over steps first
+#: + 1 to last, or if both are 0 the value of the first substep, and their ratio A/B ("AB"), B/A ("BA") or none ("").
 SCENE_VERSION = 1  # Version of the files of `write_scene`.
 PRESETS_PATH = Path(__file__).resolve().parent / "page" / "presets.json"
 

@@ -99,7 +99,7 @@ def test_page_scenes_are_the_start_of_native_ones():
 
 @needs_compiler
 def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
-    """Run each preset with the page's modules; compare with engine.md and chapter-answers.md."""
+    """Run each preset with the page's modules; compare with engine.md and course/answers.md."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
@@ -117,7 +117,7 @@ def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
             )
             a, b = row.split("; ")
             assert captions[0] in a and captions[1] in b, (preset["name"], captions)
-    chapter = (ROOT / "docs" / "chapter-answers.md").read_text(encoding="utf-8")
+    chapter = (ROOT / "docs" / "course" / "answers.md").read_text(encoding="utf-8")
     cells = [
         [cell.strip(" *") for cell in line.split("|")]
         for line in chapter.splitlines()
