@@ -76,11 +76,9 @@ PLAN = Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=Fal
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "A *case* is one problem of the built-in suite, and cases of similar structure are grouped. The table\n"
-    "has a solver for each structure and each relative residual: the solver that solves the largest number of cases\n"
-    "to this residual, and among several such solvers the fastest. The number is the shifted geometric mean of its\n"
-    "times. Brackets show the number of solved cases if not all are solved. Solvers after ≈ are equally good within\n"
-    "the noise of the repetitions."
+    "For each structure of the built-in suite and each relative residual: the solver that solves the largest number "
+    "of problems, then the\nfastest, with the shifted geometric mean of its times. Solvers after ≈ are equally good "
+    "within the noise."
 )
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
@@ -609,25 +607,6 @@ def measured_page(site, report, figures):
     site.write("measured.md", "\n\n".join(parts))
 
 
-def by_law(report):
-    """Return the table of the three fastest solvers for each law, to each tolerance."""
-    rows = []
-    for law in dict.fromkeys(report.frame["law"].astype(str)):
-        cases = list(report.cases.index[report.cases["law"] == law])
-        cells = []
-        for tolerance in TOLERANCES:
-            ranking = tables.rank_solvers(report, tolerance, cases)
-            first = ranking[
-                (ranking["solved"] == ranking["solved"].max()) & (ranking["solved"] > 0)
-            ].head(3)
-            cells.append(
-                "<br>".join(f"**{name}** {format_seconds(t)}" for name, t in first["mean"].items())
-                or "none"
-            )
-        rows.append((LAW_NAMES[law], *cells))
-    return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
-
-
 def wide(*tables):
     """Return tables in a block that scrolls in the built pages; on a forge the marks are not shown."""
     return "\n\n".join(('<div class="wide">', *tables, "</div>"))
@@ -640,10 +619,7 @@ def measured_tables(report):
         f"Measured with {len(report.runs)} runs on {len(report.cases)} cases ({run['cpu']}, {run['threads']} thread, "
         f"Python {run['python']}) by\n`python docs/generate.py --tables`."
     )
-    return {
-        "by_structure": f"{by_structure(report)}\n\n{note}",
-        "by_law": f"{by_law(report)}\n\n{note}",
-    }
+    return {"by_structure": f"{by_structure(report)}\n\n{note}"}
 
 
 def fill_tables(text, tables):

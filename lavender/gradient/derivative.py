@@ -1,4 +1,45 @@
-"""Derivative of one solution: preparation, products in both directions, and checks of existence."""
+"""Derivative of one solution: preparation, products in both directions, and checks of existence.
+
+A solution λ with w = A λ − b is a root of the error map of the judge (docs/residual.md). In scaled
+variables z = √d λ, s = w/√d and y = z − s, and with Π for the projection onto the admissible
+impulses of each block, this root and its differential are
+
+::
+
+    F = z − Π(y) = 0                                                                      (1)
+    (I − P) dz + P ds = ∂Π/∂e de + √d dl         P = ∂Π/∂y, e: mu, mu r, mu_r; l: bounds that act
+
+For each block, (1) gives these equations, with ŵ = w_t/|w_t|:
+
+    row inside its bounds       dw = 0
+    contact sticks              dw = 0
+    row at a bound l            dλ = dl
+    contact open                dλ = 0
+    contact slides, tangents    dλ_t = −(dμ λ_n + μ dλ_n) ŵ − (μ λ_n/|w_t|)(I − ŵ ŵᵀ) dw_t
+    contact slides, normal      Coulomb: dw_n = 0; cone: dw_n = dμ |w_t| + μ ŵ·dw_t
+
+Spin and rolling rows have equations of the same form; an ellipse is a disk with scaled tangents, a
+round cone a disk of up to five tangents. With H = D^−½ A D^−½, (1) becomes one linear system for
+dz:
+
+::
+
+    G dz = P (db − dA λ)/√d + √d dl + ∂Π/∂e de,      G = I − P + P H                      (2)
+    dA λ = dJ v' + J M⁻¹ (dJᵀ λ − dM v') + dθ λ,     v' = M⁻¹ Jᵀ λ                        (3)
+
+For a scalar function with the gradient c by λ and y by v⁺ (not the y of (1)), one solve with Gᵀ
+gives the gradients by all data:
+
+::
+
+    Gᵀ q = (c + J M⁻¹ y)/√d,    s = Pᵀ q/√d,    p = M⁻¹ (y − Jᵀ s)
+    b: s    e: (∂Π/∂e)ᵀ q    A: −s λᵀ    θ: −s λ    v*: y − Jᵀ s    J: λ pᵀ − s v⁺ᵀ    M: −p v'ᵀ
+
+The implicit function theorem (Dontchev and Rockafellar 2009) requires a regular G. If rows are
+redundant, G is singular, and (2) is solved with G + εP, ε = 1e-11, and refined iteratively to one
+of its solutions. Solves with random right-hand sides detect the entries of dz that (2) does not
+determine.
+"""
 
 from __future__ import annotations
 
@@ -614,7 +655,8 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
 
     References
     ----------
-    Dontchev, Rockafellar, Implicit Functions and Solution Mappings, 2009; the derivation is in docs/derivatives.md.
+    Dontchev, Rockafellar, Implicit Functions and Solution Mappings, 2009; the derivation is in the module's
+    docstring.
 
     Examples
     --------
