@@ -232,6 +232,15 @@ def test_examples_of_the_library_run(folder, shared, compiler, tmp_path, monkeyp
     )
 
 
+@pytest.mark.skipif(
+    shutil.which("mcs") is None or shutil.which("mono") is None, reason="needs Mono's mcs and mono"
+)
+def test_declarations_in_csharp_solve_an_lcp(shared, tmp_path, monkeypatch):
+    run("mcs", "-unsafe", EXAMPLES / "Lcp.cs", f"-out:{tmp_path / 'lcp.exe'}")
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(shared.parent))
+    assert run("mono", tmp_path / "lcp.exe").split() == ["0.5", "0"]  # the LCP of README
+
+
 @pytest.mark.slow
 def test_example_box2d_with_its_solver_replaced_runs(folder, tmp_path):
     sources = os.environ.get("LAVENDER_BOX2D")
