@@ -340,7 +340,7 @@ class QPSolver(Solver):
         if max_iter == 0:
             return Claim(Status.MAX_ITERATIONS, 0, no_work, "", form.name)
         if tol > 0.0 and judge_impulse(form.problem, impulse).relative == 0.0:
-            return Claim(Status.CONVERGED, 0, no_work, "the start is a solution", form.name)
+            return Claim(Status.CONVERGED, 0, no_work, "", form.name)
         start = form.make_start(impulse) if self.backend.starts and impulse.any() else None
         deadline = Deadline(time_limit)
         if form.name == "program":

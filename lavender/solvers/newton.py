@@ -83,7 +83,7 @@ INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks
 #: Message for each code of the first phase; None if it did not solve the problem.
 WARM_START_MESSAGES = {
     UNDECIDED: None,
-    JUDGED: "as it came",
+    JUDGED: "",
     SWEPT: "warm sweeps",
     SOLVED: "joints solved directly",
 }

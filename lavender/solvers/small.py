@@ -9,7 +9,7 @@ find a solution, it returns None, and the solver runs from the beginning as on a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import groupby
 from math import inf, nan
 from typing import Any
@@ -30,12 +30,6 @@ from lavender_ext.newton.solve import MAX_ROWS_ALWAYS_DENSE
 # Key in `Derived.cache` of the problem's compiled call, a `Small`; its value is False if there is none.
 COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
 
-#: Messages if no solver ran, by the status of the start.
-NO_WORK_MESSAGES = {
-    Status.CONVERGED: "the start is a solution",
-    Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
-}
-NO_TIME_MESSAGE = "the time limit left no time for a solver"
 # If an island has at least this many rows per velocity, Newton's matrix N over velocities is treated as full: it is
 # then smaller than the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
@@ -158,10 +152,11 @@ class SmallCall:
         if counts is None or not any(counts):  # No solver ran, as for a start that is the result.
             return []
         if problem.generalized is not None:
-            return [("newton", replace(general.make_claim(Status.STALLED, counts), iterations=0))]
-        done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(
-            counts
-        )
+            done = _split_velocity_counts(counts)
+        else:
+            done = (_split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts)(
+                counts
+            )
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def make_claim(
@@ -172,18 +167,16 @@ class SmallCall:
         after: float,
         status: Status = Status.CONVERGED,
     ) -> Claim:
-        """Build the claim of a call from its counts, its start (m,) or None, and its relative residual `after`."""
-        no_work = NO_WORK_MESSAGES.get(status, NO_TIME_MESSAGE)
+        """Build the claim of a call from its counts, its start (m,) or None, and its relative residual `after`.
+
+        The counts are None if no solver ran.
+        """
         if counts is None:
-            return Claim(status, 0, {}, no_work)
+            return Claim(status, 0)
         if problem.generalized is not None:
-            claim = general.make_claim(status, counts)
             if self.name == "newton":
-                return claim
-            done = claim.iterations
-            ran = [("newton", dict(claim.work))]
-            if not any(claim.work.values()):
-                return Claim(status, done, {}, no_work)
+                return general.make_claim(status, counts)
+            done, ran = _split_velocity_counts(counts)
         else:
             done, ran = (
                 _split_pivoting_counts if call_uses_pivots(problem) else _split_stage_counts
@@ -199,12 +192,30 @@ class SmallCall:
             return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
         stages = _make_stages(problem, ran, start, after)
         work = sum_work_counts(stage.work for stage in stages)
-        return Claim(status, done, work, describe_stages(stages) or no_work, stages=stages)
+        return Claim(status, done, work, describe_stages(stages), stages=stages)
 
 
 SolverWork = list[
     tuple[str, dict[str, int]]
 ]  # (name of the solver, {kind of work: count}) of each stage.
+
+
+def _split_velocity_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
+    """Return the iterations and the work of each solver from the counts of a call over J and M.
+
+    Lanes sweep over the rows first, as `pgs` does, and continue by Newton steps over the rows; Newton's method over
+    velocities runs without lanes, or after them (`lavender_ext/batch/lanes.h`).
+    """
+    sweeps, steps = counts[4:6]
+    ran: SolverWork = []
+    if sweeps:
+        ran.append(("pgs", {"sweeps": sweeps}))
+    if steps:
+        ran.append(("newton", {"factorisations": steps}))
+    claim = general.make_claim(Status.CONVERGED, counts)
+    if any(claim.work.values()):
+        ran.append(("newton", dict(claim.work)))
+    return claim.iterations, ran
 
 
 def _split_pivoting_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:

@@ -2,7 +2,9 @@
 
     start            if the start is a solution, nothing runs
     compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method
-                     is estimated to cost no more than the first sweeps (`small.py`); attempted once
+                     is estimated to cost no more than the first sweeps (`small.py`); attempted once. One island of
+                     bounded rows and contacts over at most 40 velocities gets 6 sweeps and Newton steps over its rows
+                     first, with the bits of worlds in lanes (`lavender_ext/batch/lanes_body.h`)
     large problems   under Coulomb's law, from `relaxed_rows` rows on (of J and M, if the velocities belong to free
                      bodies). The convex relaxation has the same solution if no contact slips, so it comes first, and
                      every iterate is judged under Coulomb's law. Islands that a stage has solved do not continue. If
@@ -146,7 +148,7 @@ class Auto(Solver):
                     return replace(claim, judged=result)
         failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
-            return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
+            return Claim(Status.CONVERGED, 0)
         log = SolveLog(problem, tol, max_iter, deadline)
         tree = DecisionTree(problem, deadline, log, state.first_stage)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None

@@ -109,7 +109,7 @@ def compute_postponed_fields(
         claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
         claim = spec.small.make_claim(problem, counts, start, judged.relative, status)
-    run = FinishedRun(problem, spec, {}, judged.impulse, claim, tol=0.0)
+    run = FinishedRun(problem, spec, {}, judged.impulse, claim, tol=0.0, start=start)
     return make_fields(run, judged)
 
 

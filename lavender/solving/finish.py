@@ -53,6 +53,14 @@ from lavender_ext.judge.measure import Judged, all_finite, project_far_excess_of
 CONTRADICTING_IMPULSE_RATIO = 100.0
 
 
+#: Reasons why no solver ran, if the start is no solution, by the status of the claim.
+REASONS_WITHOUT_WORK = {
+    ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
+    TIME_LIMIT: "the time limit left no time for a solver",
+    MAX_ITERATIONS: "no iterations were allowed",
+}
+
+
 class FinishedRun(NamedTuple):
     """One run of a solver: the arguments, the impulse and the claim that it returned, and the time that it took."""
 
@@ -62,6 +70,7 @@ class FinishedRun(NamedTuple):
     impulse: FloatArray  # (m,) [N s]
     claim: Claim
     tol: float
+    start: FloatArray | None = None  # (m,) [N s] Start as it was given; None: the zero impulse.
     setup_time: float = 0.0  # [s]
     solve_time: float = 0.0  # [s]
     history: History | None = None
@@ -194,6 +203,9 @@ def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> 
     """Return the other fields of a solution, the status included if the claim needs a check; else it is confirmed."""
     spec = run.spec
     claim = run.claim
+    if not (claim.message or claim.iterations or any(claim.work.values())):
+        claim = replace(claim, message=explain_why_nothing_ran(run, judged.relative))
+        run = run._replace(claim=claim)
     order = ""
     if spec.order:
         order = get_order_name(run.options.get("order", "given"))
@@ -214,6 +226,23 @@ def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> 
         "stages": claim.stages,
     }
     return fields | check_claim(run, result) if needs_check else fields
+
+
+def explain_why_nothing_ran(run: FinishedRun, relative: float) -> str:
+    """Return why no solver ran, as the message of a solution without work; no other function calls a start a solution.
+
+    `relative` is the relative residual of the returned impulse.
+    """
+    problem, status = run.problem, run.claim.status
+    if not problem.m:
+        return "nothing to solve"
+    if status is CONVERGED or relative <= run.tol:
+        start = problem._start if run.start is None else run.start
+        changed = int(np.count_nonzero(run.impulse != start))
+        if not changed:
+            return "the start is a solution"
+        return f"the start is a solution after {changed} of {problem.m} impulses were moved to their bounds or to zero"
+    return REASONS_WITHOUT_WORK.get(status, "no solver ran")
 
 
 def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
-from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
+from lavender.solvers.small import describe_stages
 from lavender.solving.loop import Loop, Record
 from lavender_ext.judge.measure import BestImpulse, are_bit_identical, residuals_by_island
 
@@ -228,11 +228,8 @@ class SolveLog:
         status = self.status
         if self.timed_out and status in (Status.STALLED, Status.NUMERICAL_ERROR):
             status = Status.TIME_LIMIT
-        no_work = NO_TIME_MESSAGE if self.deadline.is_set else "no solver ran"
-        no_work = no_work if self.budget > 0 else "no iterations were allowed"
-        no_work = NO_WORK_MESSAGES.get(status, no_work)
         messages = [
-            describe_stages(self.stages) or ("" if self.failure else no_work),
+            describe_stages(self.stages),
             self.failure,
             self.remark,
         ]

@@ -60,7 +60,6 @@ from lavender.solvers.certify import check_infeasibility_claim
 from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
-from lavender.solvers.small import NO_TIME_MESSAGE
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, decide_empty_rows, finish, name_lost_row
 from lavender.solving.limits import check_time_limit, make_deadline, reserve_time_of_judge
@@ -446,7 +445,7 @@ class Prepared:
         elif setup.solver is None or (
             deadline is not None and deadline.has_passed() and not spec.external
         ):
-            claim = Claim(TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
+            claim = Claim(TIME_LIMIT, 0)
             loop.keep_start()
         else:
             has_checks = (
@@ -481,6 +480,7 @@ class Prepared:
                 loop.impulse,
                 claim,
                 tol=loop.tol,
+                start=start,
                 setup_time=setup_time,
                 solve_time=loop.time,
                 history=None if loop.records is None else loop.get_history(),

@@ -15,7 +15,8 @@ typedef struct {
     int *left, *own;        /* lists (LANE_LIST) of the columns of each row of L and of each block that any lane has */
 } lavender_lanes_t;
 enum { LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST,
-       LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_COUNT, LANE_NUMBERS, LANE_ROWS = 48,
+       LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_SWEEPS, LANE_STEPS, LANE_COUNT,
+       LANE_NUMBERS, LANE_ROWS = 48,
        LANE_VELOCITIES = 40, LANE_LIST = LANE_VELOCITIES + 1,
        LANE_TRIANGLE = LANE_VELOCITIES * LANE_LIST / 2 };
 /* Replace the columns of M left of the diagonal (n sets) by the columns of L, and write the ancestors of each column, itself

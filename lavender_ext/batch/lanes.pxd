@@ -21,6 +21,7 @@ from lavender_ext.factor.factors cimport has_wide
 from lavender_ext.host cimport grow_workspace_to
 from lavender_ext.judge.refine cimport min_reported_loss
 from lavender_ext.judge.score cimport make_empty_score, relative_residual, score_t, unit_roundoff
+from lavender_ext.small.task cimport COUNT_ITERATIONS, COUNT_STEPS_OF_LANE, COUNT_SWEEPS_OF_LANE
 
 
 cdef extern from "lanes.h":
@@ -37,7 +38,7 @@ cdef extern from "lanes.h":
         int32_t *left, *own
     enum:
         LANE_IS_PLAIN, LANE_START_ENERGY, LANE_START_SPEED, LANE_RHS, LANE_CONDITION, LANE_ENERGY, LANE_SPEED, LANE_WORST
-        LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_STEPS, LANE_COUNT, LANE_NUMBERS
+        LANE_FLOOR_ENERGY, LANE_FLOOR_SPEED, LANE_WORK, LANE_HEAVIEST, LANE_SWEEPS, LANE_STEPS, LANE_COUNT, LANE_NUMBERS
         MAX_LANE_ROWS "LANE_ROWS"
         MAX_LANE_VELOCITIES "LANE_VELOCITIES"
         LANE_LIST, LANE_TRIANGLE
@@ -237,6 +238,15 @@ cdef inline double lane_number(const lanes_t* x, int32_t which, int32_t width, i
     return x.out[which * width + lane]
 
 
+cdef inline void add_lane_counts(const lanes_t* x, int32_t width, int32_t lane, int32_t* counts) noexcept nogil:
+    """Add the work of one lane to the counts of a task: sweeps, Newton steps, and both as iterations."""
+    cdef int32_t sweeps = <int32_t>lane_number(x, LANE_SWEEPS, width, lane)
+    cdef int32_t steps = <int32_t>lane_number(x, LANE_STEPS, width, lane)
+    counts[COUNT_SWEEPS_OF_LANE] += sweeps
+    counts[COUNT_STEPS_OF_LANE] += steps
+    counts[COUNT_ITERATIONS] += sweeps + steps
+
+
 cdef inline score_t score_of_lane(const lanes_t* x, int32_t width, int32_t lane) noexcept nogil:
     """Return the score of the judged impulse of a lane."""
     cdef score_t s = make_empty_score()
@@ -271,9 +281,12 @@ cdef inline bint is_solved_in_one_lane(const blocks_t* p, const generalized_t* g
     return True
 
 
-cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g, const double* zero_residual, double tol,
-                                      workspace_t* workspace, double* lam) noexcept nogil:
-    """Solve from the zero impulse, with the bits of a lane, into lam (m); return the Newton steps, -1 without memory."""
+cdef inline bint solve_in_one_lane(const blocks_t* p, const generalized_t* g, const double* zero_residual, double tol,
+                                   workspace_t* workspace, double* lam, int32_t* counts) noexcept nogil:
+    """Solve from the zero impulse, with the bits of a lane, into lam (m); return False without memory.
+
+    The work is added to counts (`add_lane_counts`).
+    """
     cdef lanes_t x
     cdef int32_t i, r, a, nc
     cdef uint64_t columns
@@ -282,7 +295,7 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
     cdef const double* y
     x.m, x.n, x.law, x.tol, x.k = p.n_rows, g.n, p.law, tol, p.n_blocks
     if not grow_workspace_to(workspace, 0, bind_lanes(&x, 1, NULL)):
-        return -1
+        return False
     bind_lanes(&x, 1, workspace.real)
     list_lane_blocks(p, &x, ptr, kind)
     memset(x.y, 0, <int64_t>x.m * x.n * sizeof(double))
@@ -300,6 +313,7 @@ cdef inline int32_t solve_in_one_lane(const blocks_t* p, const generalized_t* g,
     x.b, x.d, x.soft, x.mu = <double*>p.b, <double*>p.d, <double*>g.compliance, <double*>p.mu
     x.lower, x.upper = <double*>p.lower, <double*>p.upper
     x.out[LANE_IS_PLAIN], x.out[LANE_START_ENERGY], x.out[LANE_START_SPEED] = 1.0, zero_residual[0], zero_residual[1]
-    x.out[LANE_STEPS], x.out[LANE_COUNT], x.lam = 0.0, x.m, lam
+    x.out[LANE_COUNT], x.lam = x.m, lam
     solve_one(&x, has_wide())
-    return <int32_t>x.out[LANE_STEPS]
+    add_lane_counts(&x, 1, 0, counts)
+    return True

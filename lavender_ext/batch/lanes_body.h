@@ -293,9 +293,10 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
     const V *y = (const V*)x->y, *soft = (const V*)x->soft, *d = (const V*)x->d, zero = {0.0}, one = zero + 1.0;
     V *a = (V*)x->a, *lam = (V*)x->lam, *step = (V*)x->step, *change = (V*)x->change, *kept = (V*)x->kept;
     V *out = (V*)x->out, *across = (V*)x->g;
-    V now, steps = zero, misses = zero;
+    V now, sweeps, steps = zero, misses = zero;
     int own[LANE_VELOCITIES];
     I on = (I)(out[LANE_IS_PLAIN] > 0.0);
+    out[LANE_SWEEPS] = out[LANE_STEPS] = zero;
     for (int r = 0; r < m; r++) {
         lam[r] = zero;
         on &= (I)(out[LANE_COUNT] <= (double)n) | (I)(soft[r] >= 1e-5 * d[r]);
@@ -345,6 +346,7 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
         step[r + 1] = step[r + 2] = 1.0 / low;
     }
     LANE(sweep)(x, FIRST_SWEEPS, on);
+    sweeps = LANE(pick)(on, zero + (double)FIRST_SWEEPS, zero);
     now = LANE(measure)(x);
     on &= (I)(now > 0.25 * x->tol * x->tol);
     for (int round = 0; round < ROUNDS && LANE(any)(on); round++) {
@@ -365,6 +367,7 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
         if (LANE(any)(worse)) {
             for (int r = 0; r < m; r++) lam[r] = LANE(pick)(worse, kept[r], lam[r]);
             LANE(sweep)(x, MORE_SWEEPS, worse);
+            sweeps += LANE(pick)(worse, zero + (double)MORE_SWEEPS, zero);
             next = LANE(measure)(x);
         }
         now = next;
@@ -372,6 +375,7 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
     }
     LANE(bound)(x, lam, 1);
     for (int r = 0; r < m; r++) lam[r] += 0.0;
+    out[LANE_SWEEPS] = sweeps;
     out[LANE_STEPS] = steps;
 }
 

@@ -29,9 +29,9 @@ from lavender_ext.small.task cimport (N_CALL_WORKSPACES, N_COUNTS, RESULT_FAILED
 from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve_task
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
-from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED, LANE_STEPS,
-                                       MAX_LANES,
-                                       arrange_lanes, bind_lanes, compute_structure_key, count_lanes, is_lane_refined,
+from lavender_ext.batch.lanes cimport (LANE_IS_PLAIN, LANE_RHS, LANE_START_ENERGY, LANE_START_SPEED,
+                                       MAX_LANES, add_lane_counts, arrange_lanes, bind_lanes, compute_structure_key,
+                                       count_lanes, is_lane_refined,
                                        judge_lanes, lane_number, lane_rows_t, lanes_t, load_lanes,
                                        prepare_lanes, score_of_lane, solve_lanes)
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
@@ -632,6 +632,7 @@ cdef class Worlds:
             j.floor = relative_floor_of_score(&j.score, j.zero_residual[0], j.zero_residual[1])
             j.above_floor = residual_above_floor(&j.score, j.relative, j.floor)
             if not judges:
+                add_lane_counts(&x, width, lane, &self.count[N_COUNTS * i])
                 if not (j.relative <= tol and j.floor <= tol):
                     h.failed |= 1 << lane
                     continue
@@ -639,8 +640,6 @@ cdef class Worlds:
                 for k in range(x.m):
                     if rows.row[k * width + lane] >= 0:
                         lam[rows.row[k * width + lane]] = x.lam[k * width + lane]
-                k = <int32_t>lane_number(&x, LANE_STEPS, width, lane)
-                self.count[N_COUNTS * i] = self.count[N_COUNTS * i + 1] = k
             r = j.score.worst                           # All errors are 0 if this is an empty row: the first row is as bad.
             j.score.worst = max(rows.row[r * width + lane], 0) if r >= 0 else -1
             self.store_judgement(i, &j, x.e[r * width + lane] if r >= 0 else 0.0)
@@ -674,6 +673,7 @@ cdef class Worlds:
             return READY
         had_derived, j.deadline = j.has_derived, deadline
         j.tol, j.failed_in_lanes = tol, h.failed >> (h.next - 1 - h.begin) & 1
+        memcpy(j.counts, &self.count[N_COUNTS * i], sizeof(j.counts))       # work of a lane that has failed
         code = self.judge_start(i, h, &j, narrow) if judges else solve_task(&j, h.at, limits, rules)
         if j.v.g != NULL and not had_derived:
             h.made = j.made                             # The next world reuses the memory of `made`.

@@ -25,7 +25,8 @@ from lavender_ext.small.call cimport (are_all_rows_bounded, can_use_small_call, 
                                       judge_task_within_bounds, solve_small)
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
-from lavender_ext.small.task cimport (BOUND, FORMED, ISLANDS, NUMBERS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, WORK,
+from lavender_ext.small.task cimport (BOUND, COUNT_EVALUATIONS, COUNT_FACTORISATIONS, COUNT_ITERATIONS,
+                                      COUNT_ROUNDS, FORMED, ISLANDS, NUMBERS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, WORK,
                                       count_task_scratch, grow_workspace_to_arena, small_rules_t, task_t)
 from lavender_ext.batch.lanes cimport is_solved_in_one_lane, solve_in_one_lane
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
@@ -148,12 +149,11 @@ cdef inline int32_t solve_generalized_task(task_t* j, workspace_t* workspaces, c
     cdef int32_t code
     if limits.lanes != 0.0 and j.cold and not j.failed_in_lanes and j.made.n_empty == 0 \
             and is_solved_in_one_lane(p, &j.g, j.zero_residual):
-        j.counts[0] = j.counts[1] = solve_in_one_lane(p, &j.g, j.zero_residual, j.tol, workspace, j.lam)
-        if j.counts[0] >= 0 and grow_workspace_to(workspace, 0, count_task_scratch(j)):
+        if solve_in_one_lane(p, &j.g, j.zero_residual, j.tol, workspace, j.lam, j.counts) \
+                and grow_workspace_to(workspace, 0, count_task_scratch(j)):
             judge_task(j, workspace.real)
             if j.solved:
                 return RESULT_SOLVED
-        j.counts[0] = j.counts[1] = 0
     # cost limits, workspace
     soft = needs_no_proximal_terms(p, &j.g)
     cost = estimate_newton_cost_terms(p, &j.g, limits)
@@ -177,7 +177,9 @@ cdef inline int32_t solve_generalized_task(task_t* j, workspace_t* workspaces, c
     if lav_start(&j.v, &o, &r, j.lam, workspace, grow_workspace_to) != MORE:
         return RESULT_FAILED
     code = lav_step(&j.v, &o, &r, o.budget, j.lam, &info)
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
+    j.counts[COUNT_ITERATIONS] += info.work
+    j.counts[COUNT_FACTORISATIONS], j.counts[COUNT_ROUNDS] = info.factorisations, info.rounds
+    j.counts[COUNT_EVALUATIONS] = info.evaluations
     is_late = has_passed(j.deadline, 0.0)
     if (code != REACHED and not is_late) or not grow_workspace_to(workspace, 0, count_task_scratch(j) + p.n_rows):
         return RESULT_FAILED

@@ -15,6 +15,14 @@ from lavender_ext.judge.score cimport score_t
 cdef enum:
     N_COUNTS = 8                # counters of one call
 
+cdef enum:                      # counters of a call over J and M; those over A and bodies are in small/call.pyx
+    COUNT_ITERATIONS = 0        # all sweeps and steps
+    COUNT_FACTORISATIONS = 1    # Newton's method over velocities
+    COUNT_ROUNDS = 2            # its Coulomb rounds
+    COUNT_EVALUATIONS = 3       # evaluations of its line search
+    COUNT_SWEEPS_OF_LANE = 4    # sweeps over rows in a lane
+    COUNT_STEPS_OF_LANE = 5     # Newton steps over rows in a lane, a factorisation each
+
 cdef enum:                      # result code of a call
     RESULT_FAILED = 0           # The relative residual is above tol: there is no result.
     RESULT_SOLVED = 1
@@ -64,7 +72,7 @@ cdef struct task_t:             # one problem, its start and its result
     double* slack_error         # (2 m + 1) w, e
     const double* push          # (n) M^-1 J^T lam over J and M; in workspace that the next problem reuses
     bint solved                 # relative residual and floor are at most tol
-    int32_t counts[N_COUNTS]    # J and M: steps, factorisations, exchanges, evaluations; else as in `solve_small`
+    int32_t counts[N_COUNTS]
     score_t score
     double relative, floor, above_floor
     double float64_relative     # relative residual of the first pass; NaN if it was not refined

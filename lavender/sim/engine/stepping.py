@@ -455,6 +455,7 @@ class Stepping:
             impulse,
             claim,
             tol=self._warm_tol,
+            start=impulse,  # The phase returns a start that it only judges as it is.
             solve_time=solve_time,
         )
         return finish(run)

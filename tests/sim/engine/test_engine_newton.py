@@ -74,7 +74,7 @@ def test_scene_step_from_a_warm_start_within_tol_returns_it():
     exact = lv.solve(problem, "newton", tol=1e-10).impulse
     again = lv.solve(problem, "newton", impulse=exact, tol=1e-8)
     np.testing.assert_array_equal(again.impulse, exact)
-    assert dict(again.work) == {"factorisations": 0} and again.message == "as it came"
+    assert dict(again.work) == {"factorisations": 0} and again.message == "the start is a solution"
 
 
 #: One substep of 1/120 s in the order given: contacts on which rounds and polishes alone do not end.
