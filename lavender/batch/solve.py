@@ -30,7 +30,7 @@ from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.compiled_call import compute_postponed_fields
 from lavender.solving.limits import check_time_limit
 from lavender.solving.loop import MIN_TIME_LIMIT
-from lavender.solving.prepared import Prepared, check_arguments
+from lavender.solving.prepared import SOLVE_ARGUMENTS, Prepared, check_arguments, check_options
 from lavender.solving.solve import solve
 from lavender.solving.velocity import (
     MAX_VELOCITY_TOLERANCE,
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
 
 STATUS_OF_INDEX = np.array(list(Status), object)
+MANY_ARGUMENTS = (*SOLVE_ARGUMENTS, "impulses", "threads", "errors", "like")
 INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
 
@@ -319,7 +320,9 @@ def solve_many(
     worlds = check_problems(problems, errors)
     if type(threads) is not int or threads < 1:
         threads = check_int("threads", threads, 1, None)
-    spec, limit = get(solver), check_time_limit(time_limit)
+    spec = get(solver)
+    check_options(spec, options.keys() - SOLVE_ARGUMENTS, MANY_ARGUMENTS)
+    limit = check_time_limit(time_limit)
     if velocity_tol is not None:
         velocity_tol = check_velocity_tolerance(velocity_tol, tol)
         tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)

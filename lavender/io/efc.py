@@ -37,6 +37,7 @@ from lavender.io import mujoco as single
 from lavender.io.engine_motion import MOVERS
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_sizes, read_step
+from lavender.io.rest import set_worlds_at_rest
 from lavender.io.start_states import can_sleep
 from lavender.io.stiff_rows import make_engine_batch
 from lavender.problem import FRICTION_LAWS
@@ -213,6 +214,8 @@ def from_efc(
         jac = jac * scale[:, :, None].astype(jac.dtype)
         target = target * scale
         compliance = compliance * scale * scale
+    target[~used_rows] = 0.0
+    set_worlds_at_rest(jac.reshape(-1, nv), free, target.reshape(-1), m * np.arange(n + 1))
 
     def make_batch(soft: FloatArray) -> Batch:
         batch = Batch(
@@ -440,6 +443,7 @@ def from_mujoco_many(
     jac, (target, compliance, lam), free, change, places, contact_counts = join_worlds(
         rows_of_states, moves, dt
     )
+    set_worlds_at_rest(jac, free, target, places[0])
     if matrices:
         mass, indices, indptr = _merge_lower_triangles(matrices, mass, indices, indptr)
     blocks_of_states = [None if rows is None else rows[3] for rows in rows_of_states]

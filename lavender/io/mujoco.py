@@ -39,6 +39,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.io.engine_motion import EngineMotion
 from lavender.io.mujoco_discrete import MASS_TOLERANCE, compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, OTHER_MODEL_ADVICE, read_step
+from lavender.io.rest import count_tiny_as_zero
 from lavender.io.stiff_rows import MAX_EXAMINED_COMPLIANCE, raise_compliance
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
@@ -133,7 +134,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         problem: Problem = Problem._from_checked_data(view, "cone", name, (_make_fields, rest))
     else:
         if change is not None:  # MuJoCo's own a0 is as accurate as opt.tolerance only.
-            b = mark_read_only(b - dt * general.velocity_of(change))
+            b = mark_read_only(count_tiny_as_zero(b - dt * general.velocity_of(change)))
             general = general.with_jacobian(v_free=v_free + dt * change)
         fields = _make_fields(*rest[:3], b, compliance, general)
         problem = Problem(**fields, friction="cone", name=name, copy=False)

@@ -7,6 +7,7 @@ are in `solving/loop.py`, the end is in `finish.py`.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -162,19 +163,11 @@ class Prepared:
         start = perf_counter()
         check_accepted(problem, spec)
         for name in options:
-            if name in spec.accepts:
-                continue
-            if name in SOLVE_ARGUMENTS:
+            if name in SOLVE_ARGUMENTS and name not in spec.accepts:
                 raise CapabilityError(
                     f"prepare does not take {name}=: give it to prepare(...).solve"
                 )
-            if name in ("order", "ground", "seed"):
-                accepted = ", ".join(sorted(spec.accepts)) or "no options"
-                raise CapabilityError(
-                    f"solver {spec.name!r} does not take {name}=; it takes: {accepted}"
-                )
-            known = {*spec.accepts, *SOLVE_ARGUMENTS, "solver"}
-            raise UnknownName(f"option of solver {spec.name!r}", name, known)
+        check_options(spec, options)
         self.spec = spec
         self.options = options
         self.problem = problem
@@ -552,6 +545,22 @@ class Prepared:
         loop.time += solution.setup_time + solution.solve_time
         work = sum_work_counts((claim.work, solution.work))
         return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
+
+
+def check_options(
+    spec: SolverSpec, options: Iterable[str], arguments: Iterable[str] = SOLVE_ARGUMENTS
+) -> None:
+    """Raise an error for the first option that the solver does not take; `arguments` are those of the caller."""
+    for name in options:
+        if name in spec.accepts:
+            continue
+        if name in ("order", "ground", "seed"):
+            accepted = ", ".join(sorted(spec.accepts)) or "no options"
+            raise CapabilityError(
+                f"solver {spec.name!r} does not take {name}=; it takes: {accepted}"
+            )
+        known = {*spec.accepts, *arguments, "solver"}
+        raise UnknownName(f"option of solver {spec.name!r}", name, known)
 
 
 def check_accepted(problem: Problem, spec: SolverSpec) -> None:

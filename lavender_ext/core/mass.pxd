@@ -45,7 +45,7 @@ cdef inline int32_t compress_lower_triangle(const double* a, int64_t stride, dou
                                             int32_t* idx, double* val) noexcept nogil:
     """Write the lower triangle of a (n, n) in compressed rows, with every diagonal entry; return the number of entries.
 
-    Returns -1 if `relative_entry_asymmetry` of an entry is above `max_asymmetry`.
+    Returns -1 if `relative_entry_asymmetry` of an entry is above `max_asymmetry` or NaN.
     """
     cdef bint symmetric = is_symmetric(a, stride, n)
     cdef const double* row = a
@@ -56,7 +56,7 @@ cdef inline int32_t compress_lower_triangle(const double* a, int64_t stride, dou
             q += thin(i, row, NULL, idx + q, val + q)
         for j in range(0 if symmetric else i):
             if row[j] != 0.0 or a[j * stride + i] != 0.0:
-                if row[j] != a[j * stride + i] and relative_entry_asymmetry(a, stride, i, j) > max_asymmetry:
+                if row[j] != a[j * stride + i] and not relative_entry_asymmetry(a, stride, i, j) <= max_asymmetry:
                     return -1
                 idx[q] = j
                 val[q] = row[j]

@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport as_double_pointer, as_int_pointer, make_read_only, ndarray
 from lavender_ext.core.blocks cimport Blocks, allocate_blocks
-from lavender_ext.core.validate cimport all_finite, is_valid_magnitude, is_valid_number, update_max_abs
+from lavender_ext.core.validate cimport all_finite, is_valid_magnitude, is_valid_number, min_magnitude, update_max_abs
 from lavender_ext.core.block_types cimport ROW, blocks_t, choose_contact_kind, write_contact_bounds
 
 ctypedef const double* doubles
@@ -395,6 +395,7 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
+    A b with all entries below 1e-60 m/s counts as 0, as of bodies that friction has brought to rest.
     `is_regular`: all numbers are valid, no gap exceeds its tolerance, and compliances are at most `usual`. The gaps are errors of
     J v = efc_vel with v before the step (None: qvel), J a0 - aref = efc_b and J^T efc_force = qfrc_constraint, divided by the
     sizes of the terms. They are 0 if the stored vector is 0, as in a copy. The fourth gap is NaN if an acceleration is not finite.
@@ -444,6 +445,9 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
         x = scale[i] * dt * p.efc_b[i]
         gap[1], stored[1] = update_max_abs(gap[1], b[i] + x), update_max_abs(stored[1], p.efc_b[i])
         terms[1] = update_max_abs(terms[1], size * max_change + fabs(b[i]) + fabs(x))
+    if 0.0 < max_b < min_magnitude():                   # The bodies are at rest: a problem refuses such a b.
+        memset(b, 0, m * sizeof(double))
+        max_b = 0.0
     for j in range(n):
         x = p.qfrc_constraint[j]
         gap[2], stored[2] = update_max_abs(gap[2], force[j] - x), update_max_abs(stored[2], x)

@@ -62,6 +62,11 @@ cdef enum:
     MAX_COULOMB_ROUNDS = 12     # Problems that need more rounds are solved faster by other methods.
 
 
+cdef inline double smallest_tol() noexcept nogil:
+    """Return the tol to which errors are compared if it is 0: no product with E0 or V0 underflows, and no rounding reaches it."""
+    return 1e-200
+
+
 # -- line searches ----------------------------------------------------------------------------------------------
 
 
@@ -472,7 +477,8 @@ cdef inline void choose_island_unknowns(flow_t* f, int32_t island) noexcept nogi
     if f.p.islands != NULL:
         own = f.p.islands.reference + 2 * f.p.islands.label[first_block_of_run(f, f.iptr[island])]
         energy, velocity = max(own[0], 0.0), max(own[1], 0.0)
-    f.energy_limit, f.velocity_limit = f.tol * energy, f.tol * velocity
+    # With tol = 0 errors are compared, too, so that the best iterate is known.
+    f.energy_limit, f.velocity_limit = max(f.tol, smallest_tol()) * energy, max(f.tol, smallest_tol()) * velocity
     f.is_over_rows = f.over_rows[island]
     f.unknowns, f.n_unknowns = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
     if not f.is_over_rows:

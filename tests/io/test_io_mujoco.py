@@ -455,3 +455,30 @@ def test_from_mujoco_of_other_objects_raises():
         lv.io.from_mujoco(data, model)
     with pytest.raises(lv.InputError, match=r"impulse \[N s\] has shape"):
         adapter.acceleration(model, data, np.zeros(int(data.nefc) + 1))
+
+
+@pytest.mark.parametrize("option", ['solver="PGS"', 'integrator="discrete"'])
+def test_joint_with_friction_is_judged_after_it_has_come_to_rest(option):
+    """The velocity falls by a constant factor in each step, past 1e-60 rad/s; such a b counts as 0."""
+    damping = 0 if "PGS" in option else 1
+    model = mj.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.002" gravity="0 0 0" {option}/><worldbody><body>
+        <joint type="hinge" axis="0 0 1" frictionloss="1" damping="{damping}"/>
+        <geom type="cylinder" size=".1 .05" mass="1"/></body></worldbody></mujoco>"""
+    )
+    data = mj.MjData(model)
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    state_of = np.zeros(mj.mj_stateSize(model, kind))
+    for velocity in (1e-3, 1e-59, 8e-61, 1e-62, 1e-70, 1e-100, 1e-200):
+        data.qvel[:] = velocity
+        mj.mj_forward(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        one = lv.residual(problem, adapter.impulse(model, data))
+        assert (velocity >= 1e-59) == bool(problem.b.any())
+        mj.mj_getState(model, data, state_of, kind)
+        batch, impulse = lv.io.from_mujoco_many(model, state_of[None])
+        many = lv.residual_many(batch, impulse)
+        # MuJoCo's solver ends at absolute tolerances, so that only the first answer is exact.
+        allowed = (1e-9 if velocity == 1e-3 else 2.0) * velocity
+        assert max(one.velocity, many.velocity_error[0]) <= allowed
+        assert lv.solve_many(batch).success[0]

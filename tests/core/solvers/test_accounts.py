@@ -28,7 +28,9 @@ def axis_contact(law, form):
         cones = lv.Cones.bounded(-bound if law == "linear" else np.zeros(3), bound)
         problem = lv.Problem.from_jacobian(jac, mass, free, cones=cones)
     else:
-        problem = lv.Problem.from_jacobian(jac, mass, free, cones=lv.Cones.contacts(0.4), friction=law)
+        problem = lv.Problem.from_jacobian(
+            jac, mass, free, cones=lv.Cones.contacts(0.4), friction=law
+        )
     return as_matrix(problem) if form == "matrix" else problem
 
 
@@ -95,7 +97,9 @@ def find_fault(problem, start, solution):
     if message.startswith(IS_MOVED):
         cones, moved = problem.cones, solution.impulse != given
         allowed = [project_impulse(cones, given), problem.start()]
-        known = np.logical_or.reduce([np.isclose(solution.impulse, x, rtol=1e-12, atol=0.0) for x in allowed])
+        known = np.logical_or.reduce(
+            [np.isclose(solution.impulse, x, rtol=1e-12, atol=0.0) for x in allowed]
+        )
         return "" if solved and moved.any() and known.all() else "the start is not the result"
     if message.startswith(IS_START):
         return "" if solved and same else "the start is not the result, or no solution"
