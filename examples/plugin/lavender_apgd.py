@@ -11,13 +11,8 @@ from math import sqrt
 import numpy as np
 
 import lavender as lv
-
-CHECK_EVERY = (
-    10  # iterations between two looks at the residual, counted from the start of the state
-)
-GROWN = (
-    1e12  # relative residual above which nothing is to be hoped for: A has a negative eigenvalue
-)
+from lavender.base.arrays import check_bool
+from lavender.solvers.sweeping import create_stopping_test, make_claim
 
 
 @dataclass
@@ -27,9 +22,9 @@ class State:
     problem: lv.Problem
     A: object  # (m, m) CSR, 1/kg
     step: np.ndarray  # (m,) kg, s / d
+    watch: object  # the stopping test: it checks the residual, and keeps the impulse that the solve returns
     before: np.ndarray | None = None  # (m,) N s, the iterate before the last
     theta: float = 1.0
-    done: int = 0
 
 
 @dataclass(frozen=True)
@@ -38,41 +33,40 @@ class APGD:
 
     restart: bool = True
 
+    def __post_init__(self):
+        check_bool("restart", self.restart)
+
     def prepare(self, problem):
         """Everything that does not depend on the iterate."""
         A, d = problem.csr, problem.d
         largest = float((abs(A).sum(axis=1) / d).max(initial=0.0))
-        return State(problem, A, 1.0 / (max(largest, 1.0) * d))
+        watch = create_stopping_test(problem, problem.csr_data)
+        return State(problem, A, 1.0 / (max(largest, 1.0) * d), watch)
 
     def update(self, state, problem):
         """Return the state for new numbers of the same structure; nothing can be reused."""
         return self.prepare(problem)
 
     def run(self, state, impulse, n, tol, time_limit=None):
-        """n more iterations on `impulse` in place, fewer only where its own test stops it."""
-        problem = state.problem
-        cones = state.problem.cones
-        before = impulse.copy() if state.before is None else state.before
-        for i in range(n):
-            if tol > 0.0 and state.done % CHECK_EVERY == 0:
-                relative = lv.residual(problem, impulse).relative
-                if not tol < relative < GROWN:
-                    state.before = before
-                    status = lv.Status.CONVERGED if relative <= tol else lv.Status.DIVERGED
-                    return lv.Claim(status, i, {"products": i})
-            theta = state.theta
-            now = impulse.copy()
-            after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
-            y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - before)
-            impulse[:] = np.clip(
-                y - state.step * (state.A @ y - problem.b), cones.lower, cones.upper
-            )
-            uphill = (y - impulse) @ ((impulse - now) / state.step) > 0.0
-            state.theta = 1.0 if self.restart and uphill else after
-            before = now
-            state.done += 1
-        state.before = before
-        return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"products": n})
+        """n more iterations on `impulse` in place, fewer only if the stopping test ends them."""
+        problem, cones = state.problem, state.problem.cones
+
+        def iterate(count, first):
+            if first:  # The test may have replaced the start by the zero impulse.
+                state.before = impulse.copy()
+            for _ in range(count):
+                theta, now = state.theta, impulse.copy()
+                after = 0.5 * theta * (sqrt(theta * theta + 4.0) - theta)
+                y = now + theta * (1.0 - theta) / (theta * theta + after) * (now - state.before)
+                impulse[:] = np.clip(
+                    y - state.step * (state.A @ y - problem.b), cones.lower, cones.upper
+                )
+                uphill = (y - impulse) @ ((impulse - now) / state.step) > 0.0
+                state.theta = 1.0 if self.restart and uphill else after
+                state.before = now
+
+        status, done = state.watch.run_python(iterate, impulse, n, tol)
+        return make_claim(status, done, "products")
 
 
 def refusal(problem):

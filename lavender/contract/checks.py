@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import inspect
+import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError, UnknownName, format_error
+from lavender.base.errors import CapabilityError, LavenderError, UnknownName, format_error
 from lavender.contract.problems import (
+    BALLS,
     EMPTY,
+    GROUPS,
     INFEASIBLE,
     change_numbers,
-    make_large_problems,
     make_problems,
 )
 from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import judge_impulse, residual
 from lavender.judge.solution import Solution, Status
 from lavender.problem import Problem
+from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.prepared import prepare
 from lavender.solving.solve import solve
@@ -39,9 +46,13 @@ WORK_COUNTERS = {
     "backend_calls",
 }
 MIN_BUDGET = 5_000  # Iterations that a resumable solver may use on a problem.
-Requirement = Callable[
-    [SolverSpec, Problem], str
-]  # Returns the sentence of a failure, or an empty string.
+LONG_BUDGET = 60_000  # Iterations after which a run that rounding keeps above tol must have ended.
+# One penalty for all islands: an island without a solution may keep the others from Coulomb's law.
+COUPLED_ISLANDS = {("admm", "coulomb")}
+# The top of a solver's file may import these, besides the standard library.
+LIGHT_PACKAGES = {"numpy", "lavender", "lavender_ext", "typing_extensions"}
+# Returns the sentence of a failure, or an empty string.
+Requirement = Callable[[SolverSpec, Problem], str]
 
 
 class ContractError(AssertionError):
@@ -78,7 +89,8 @@ class Failure(NamedTuple):
 class Check:
     """One requirement: a name, a sentence, the solvers to which it applies, its code and its problems.
 
-    `problems` are "all", those that are "solvable" and not large, "large", or the "first" that the solver accepts.
+    `problems` are the word of one of `GROUPS`, "all" others, the "solvable" ones of these, or the "first" that the
+    solver accepts.
     """
 
     name: str
@@ -90,7 +102,6 @@ class Check:
 
     def run(self, spec: SolverSpec) -> None:
         """Raise ContractError if a solver does not meet the requirement on a problem that it accepts."""
-        large = make_large_problems().keys()
         accepted = {
             name: problem for name, problem in make_problems().items() if not spec.refuses(problem)
         }
@@ -98,11 +109,15 @@ class Check:
             raise ContractError(
                 f"the spec lists {', '.join(missing)}, but refuses every problem with it"
             )
-        names = {
-            "all": [name for name in accepted if name not in large],
-            "solvable": [name for name in accepted if name not in {EMPTY, INFEASIBLE, *large}],
-            "large": [name for name in accepted if name in large],
-            "first": [*accepted][:1],
+        groups = {
+            word: [name for name in make() if name in accepted] for word, make in GROUPS.items()
+        }
+        grouped = {name for names in groups.values() for name in names}
+        usual = [name for name in accepted if name not in grouped]
+        names = groups | {
+            "all": usual,
+            "solvable": [name for name in usual if name not in (EMPTY, INFEASIBLE)],
+            "first": usual[:1],
         }
         for name in names[self.problems]:
             if failure := self.function(spec, accepted[name]):
@@ -194,6 +209,13 @@ def solve_to_tolerance(spec: SolverSpec, problem: Problem, **options: Any) -> So
 def get_bits(solution: Solution) -> tuple[bytes, Status, int]:
     """Return impulse bits, status and iterations of a result."""
     return solution.impulse.tobytes(), solution.status, solution.iterations
+
+
+def get_data_bits(problem: Problem) -> list[bytes]:
+    """Return the bits of the arrays of a problem that solvers read."""
+    cones, csr = problem.cones, problem.csr
+    arrays = (problem.b, problem.d, cones.lower, cones.upper, cones.mu, csr.data, csr.indices)
+    return [np.asarray(x).tobytes() for x in arrays]
 
 
 @check("all solvers", lambda spec: True, problems="all")
@@ -290,7 +312,10 @@ def require_budgets_are_kept(spec: SolverSpec, problem: Problem) -> str:
 def require_bits_are_reproducible(spec: SolverSpec, problem: Problem) -> str:
     """Require that threads, `update` instead of `prepare`, and 1 + 7 + 15 instead of 23 iterations change no bit."""
     options: dict[str, Any] = {"tol": 1e-7, "max_iter": 60 if spec.resumable else None}
+    data = get_data_bits(problem)
     bits = get_bits(solve(problem, spec.name, **options))
+    if get_data_bits(problem) != data:
+        return "the solve changed the arrays of the problem"
     for other in (
         replace(problem, b=problem.b * 1.25 + 0.01, qp=problem.qp),
         change_numbers(problem),
@@ -298,11 +323,14 @@ def require_bits_are_reproducible(spec: SolverSpec, problem: Problem) -> str:
         if spec.refuses(other):
             continue
         prepared = prepare(other, spec.name)
-        prepared.solve(**options)
+        first = prepared.solve(**options)
+        kept = first.impulse.tobytes()
         if get_bits(prepared.solve(problem, **options)) != bits:
             return (
                 "`update` with another A, b, bounds or coefficients gives other bits than `prepare`"
             )
+        if first.impulse.tobytes() != kept:
+            return "a later solve changed the impulse of an earlier solution: keep no view of it"
     with ThreadPoolExecutor(4) as pool:
         if {*pool.map(lambda p: get_bits(solve(p, spec.name, **options)), [problem] * 4)} != {bits}:
             return "the same call gives other bits, from one of four threads"
@@ -392,3 +420,189 @@ def require_orders_change_the_sweep(spec: SolverSpec, problem: Problem) -> str:
         if same
         else f"two of {choices} give the same bits after 2 sweeps, or one gives two results"
     )
+
+
+@check(
+    "all solvers except code of another project",
+    lambda spec: not spec.external,
+    problems="unsolvable",
+)
+def require_results_without_a_solution_are_not_worse_than_zero(
+    spec: SolverSpec, problem: Problem
+) -> str:
+    """Require that a problem without a solution is not claimed solved, and its result is no worse than zero."""
+    for max_iter in (None, 7):
+        solution = solve(problem, spec.name, max_iter=max_iter)
+        text = f"max_iter={max_iter} the result is: {solution}"
+        if (
+            solution.success
+            or solution.claim_check != "confirmed"
+            or solution.status == "ROUNDOFF_LIMIT"
+        ):
+            return f"with {text}. No impulses solve the problem: a claim may be INFEASIBLE, with a certificate"
+        judged = solution.residual
+        if max_iter is None and not judged.energy <= judged.energy_at_zero * (1.0 + 1e-12):
+            return (
+                f"with {text}. Its energy error is {judged.energy / judged.energy_at_zero:.3g} times that of zero "
+                "impulses: end the run as DIVERGED or STALLED, for example by "
+                "lavender.solvers.sweeping.create_stopping_test"
+            )
+    return ""
+
+
+@check(
+    "all solvers except code of another project", lambda spec: not spec.external, problems="jammed"
+)
+def require_islands_are_solved_next_to_an_island_without_a_solution(
+    spec: SolverSpec, problem: Problem
+) -> str:
+    """Require that rows that contradict each other do not keep other islands from their solution."""
+    solution = solve(problem, spec.name)
+    relative = solution.residual.islands.relative
+    if not relative.max() <= 1.0 + 1e-3:  # Rounding of large impulses may hide the rest.
+        return f"the result is: {solution}. An island ends worse than with zero impulses"
+    if (spec.name, problem.law) in COUPLED_ISLANDS:
+        return ""
+    unmet = int((relative[:BALLS] > solution.tol).sum())
+    return (
+        f"{unmet} of {BALLS} islands that have a solution are not solved: {solution}"
+        if unmet
+        else ""
+    )
+
+
+@check(
+    "solvers with `impulse`, except code of another project",
+    lambda spec: spec.impulse and not spec.external,
+    problems="ill-conditioned",
+)
+def require_rounding_ends_a_solve(spec: SolverSpec, problem: Problem) -> str:
+    """Require that a solve that only rounding keeps above tol ends early, with the status ROUNDOFF_LIMIT."""
+    solution = solve(problem, spec.name, tol=1e-9, max_iter=LONG_BUDGET)
+    found = solution.residual
+    if not judge_impulse(problem, solution.impulse).relative <= 1e-9 < found.relative:
+        return ""
+    is_early = solution.iterations < LONG_BUDGET or not spec.resumable
+    if solution.status is Status.ROUNDOFF_LIMIT and is_early and found.at_floor:
+        return ""
+    return (
+        f"the result is: {solution}. ROUNDOFF_LIMIT in fewer than {LONG_BUDGET} iterations is required, as "
+        "lavender.solvers.sweeping.create_stopping_test ends a run"
+    )
+
+
+@check("all solvers except code of another project", lambda spec: not spec.external)
+def require_a_velocity_error_is_met_on_every_row(spec: SolverSpec, problem: Problem) -> str:
+    """Require that a solve to velocity_tol meets it on every row, and a solve from its result ends at once."""
+    budget = LONG_BUDGET if spec.resumable else None
+    solution = solve(problem, spec.name, velocity_tol=1e-5, max_iter=budget)
+    if not solution.success or not solution.residual.velocity <= 1e-5:
+        return f"with velocity_tol=1e-5 the result is: {solution}"
+    again = (
+        solve(problem, spec.name, velocity_tol=1e-5, impulse=solution.impulse)
+        if spec.impulse
+        else solution
+    )
+    late = spec.impulse and spec.resumable and again.iterations > 1
+    return f"a solve from its result ended as: {again}" if late or not again.success else ""
+
+
+@check(
+    "solvers with `impulse`, except code of another project",
+    lambda spec: spec.impulse and not spec.external,
+)
+def require_results_are_not_worse_than_the_start(spec: SolverSpec, problem: Problem) -> str:
+    """Require that a short solve from any start ends with no larger objective, or energy error, than the start."""
+    start = 30.0 * np.random.default_rng(0).normal(size=problem.m)
+    inside = project_impulse(problem.cones, start)
+    solution = solve(problem, spec.name, impulse=start, tol=1e-12, max_iter=1)
+    if solution.success or problem.law == "linear" or not problem.is_symmetric:
+        return ""
+    if problem.law == "coulomb":
+        begun = residual(problem, inside).islands.energy
+        keeps_last = getattr(spec.load(), "keeps_last", False)
+        is_larger = solution.residual.islands.energy > begun * (1.0 + 1e-9)
+        is_worse = not keeps_last and bool(is_larger.any())
+    else:
+        first, last = (
+            0.5 * float(x @ (problem.slack(x) - problem.b)) for x in (inside, solution.impulse)
+        )
+        # Bounds that exclude zero have no zero impulse, which otherwise counts, too.
+        highest = first if project_impulse(problem.cones, 0.0 * start).any() else min(first, 0.0)
+        is_worse = last > highest + 1e-9 * abs(first)
+    return f"a solve of one iteration ends worse than its start: {solution}" if is_worse else ""
+
+
+@check(
+    "all solvers except code of another project", lambda spec: not spec.external, problems="first"
+)
+def require_wrong_values_of_options_raise(spec: SolverSpec, problem: Problem) -> str:
+    """Require that an option with a value of a wrong kind raises an InputError that names the option."""
+    for name in spec.options:
+        wrong: tuple[Any, ...] = ("no such word", np.nan, 1j, {1: 2})
+        for value in wrong:
+            option: Any = {name: value}
+            try:
+                solve(problem, spec.name, **option)
+            except LavenderError as error:
+                if name not in str(error):
+                    return f"the error for {name}={value!r} does not name it: {error}"
+            else:
+                return (
+                    f"{name}={value!r} was accepted: raise a ValueError in the factory, for example by check_float or "
+                    "check_bool of lavender.base.arrays"
+                )
+    return ""
+
+
+@check(
+    "solvers with `resumable`", lambda spec: spec.resumable and not spec.external, problems="first"
+)
+def require_options_change_the_iterates(spec: SolverSpec, problem: Problem) -> str:
+    """Require that options whose default is a number or a truth value change the iterates of a problem."""
+    parameters = inspect.signature(spec.load()).parameters
+    accepted = [p for p in make_problems().values() if p.m and not spec.refuses(p)]
+    for name in spec.options:
+        default = parameters[name].default
+        if type(default) not in (bool, int, float) or not default:
+            continue
+        other = not default if type(default) is bool else type(default)(default / 2)
+        for problem in accepted:
+            options: tuple[Any, Any] = ({name: default}, {name: other})
+            first, second = (
+                solve(problem, spec.name, tol=0.0, max_iter=30, **option) for option in options
+            )
+            if not np.array_equal(first.impulse, second.impulse):
+                break
+        else:
+            return (
+                f"{name}={default!r} and {name}={other!r} give the same iterates on every problem"
+            )
+    return ""
+
+
+@check(
+    "solvers inside lavender and installed plug-ins",
+    lambda spec: not spec.external and bool(spec.builtin or spec.distribution),
+    problems="first",
+)
+def require_the_file_imports_numpy_alone(spec: SolverSpec, problem: Problem) -> str:
+    """Require that the top of the solver's file imports only NumPy and lavender, since every command reads it."""
+    path = inspect.getsourcefile(spec.load()) if inspect.isclass(spec.load()) else None
+    if path is None or not Path(path).is_file():
+        return ""
+    for node in ast.parse(Path(path).read_text(encoding="utf-8")).body:
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            names = [node.module or ""]
+        for package in (name.partition(".")[0] for name in names):
+            own = importlib.util.find_spec(package)
+            is_near = (
+                own is not None and own.origin and Path(own.origin).parent == Path(path).parent
+            )
+            if package not in LIGHT_PACKAGES | sys.stdlib_module_names and not is_near:
+                return (
+                    f"{path}, line {node.lineno} imports {package}: import it in the function that uses it, or from "
+                    "lavender.base.lazy_import"
+                )
+    return ""

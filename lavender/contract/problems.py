@@ -1,6 +1,7 @@
-"""The problems on which a solver is checked: one for each law, form and kind of block, and four larger ones.
+"""The problems on which a solver is checked.
 
-A solver has to solve each of them that it accepts.
+A solver has to solve each of the first that it accepts: one for each law, form and kind of block, and four larger ones.
+Others have no solution, islands without a solution next to others, or an ill-conditioned mass matrix.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ INFEASIBLE = "a row that no impulse can satisfy"  # Name of the problem without 
 EMPTY = "no rows"
 #: Number of contacts and of bounded rows of the larger problems.
 LARGE_CONTACTS, LARGE_ROWS = 20, 60
+BALLS = 10  # Islands of a jammed problem that have a solution: its first ones.
+N_OPPOSED = 6  # Number of drawn problems with opposed limits, in each form.
 
 
 def make_bodies(joints: bool, friction: str = "coulomb", mu: float = 0.0) -> Problem:
@@ -144,6 +147,103 @@ def make_large_problems() -> dict[str, Problem]:
     }
 
 
+def make_unsolvable_problems() -> dict[str, Problem]:
+    """Return problems without a solution: opposed limits, a b outside the range of A, and contacts along one ray."""
+    problems: dict[str, Problem] = {}
+    for seed in range(N_OPPOSED):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(2, 5))
+        limit = rng.normal(size=(1, n))
+        jac = np.vstack([rng.normal(size=(2, n)), limit, -limit])
+        target = [0.0, 0.0, 5.0, 5.0]
+        cones = Cones.bounded(np.zeros(4), np.full(4, np.inf))
+        general = Problem.from_jacobian(
+            jac, np.eye(n), rng.normal(size=n), target=target, cones=cones
+        )
+        problems[f"opposed limits {seed}, of J and M"] = general
+        problems[f"opposed limits {seed}, in a matrix"] = Problem.lcp(jac @ jac.T, general.b)
+    problems["b outside the range of A"] = Problem.lcp(
+        [[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf]
+    )
+    pulls = {
+        "sweeps whose impulses grow": ([-0.1, 2.6, 0.7, 1.4], [1.5, 0.0, -1.6, -0.1], [0.8, 0.5]),
+        "rows that all pull": ([-0.2, -0.7, 0.6, 2.0], [0.2, -1.1, 1.4, -1.9], [0.3, 0.6]),
+    }
+    for name, (ray, b, mu) in pulls.items():
+        problems[name] = Problem.contact(np.outer(ray, ray), b, mu)
+    return problems
+
+
+def make_jammed_problems() -> dict[str, Problem]:
+    """Return `BALLS` islands with a solution, and next to them bodies with two rows that contradict each other."""
+    free = Cones.free(2)
+    limits = Cones.bounded([0.0, 0.0], [np.inf, np.inf])
+    jams = {
+        "motors": ([1.0, 1.0], [1.0, -1.0], free, 5),
+        "limits": ([1.0, -1.0], [1.0, 1.0], limits, 1),
+        "nearly equal rows": ([1.0, 1.0 + 1e-9], [1.0, -1.0], free, 1),
+        "an empty row": ([1.0, 0.0], [1.0, 1.0], free, 1),
+    }
+    kinds: dict[str, tuple[Cones, list[float], str]] = {
+        "free rows": (Cones.free(1), [-0.1635], "coulomb"),
+        "limits": (Cones.bounded([0.0], [np.inf]), [-0.1635], "coulomb"),
+        "contacts, law coulomb": (Cones.contacts(0.5, count=1), [-0.1635, 0.3, 0.0], "coulomb"),
+        "contacts, law cone": (Cones.contacts(0.5, count=1), [-0.1635, 0.3, 0.0], "cone"),
+    }
+    problems: dict[str, Problem] = {}
+    for (kind, (ball, velocity, friction)), (
+        name,
+        (rows, target, pair, count),
+    ) in itertools.product(kinds.items(), jams.items()):
+        m = n = len(velocity) * BALLS
+        jac = np.zeros((m + 2 * count, n + count))
+        jac[:m, :n] = np.eye(n)
+        cones = ball
+        for _ in range(BALLS - 1):
+            cones = cones + ball
+        for k in range(count):
+            jac[m + 2 * k : m + 2 * k + 2, n + k] = rows
+            cones = cones + pair
+        v_free = np.r_[np.tile(velocity, BALLS), np.zeros(count)]
+        targets = [0.0] * m + target * count
+        general = Problem.from_jacobian(
+            jac, np.eye(n + count), v_free, target=targets, cones=cones, friction=friction
+        )
+        problems[f"{BALLS} {kind} next to jammed {name}, of J and M"] = general
+        matrix = Problem(general.b, cones, jac @ jac.T, friction=friction)
+        problems[f"{BALLS} {kind} next to jammed {name}, in a matrix"] = matrix
+    return problems
+
+
+def make_ill_conditioned_problems() -> dict[str, Problem]:
+    """Return problems of J and an M of condition 1e10, whose residual float64 loses above a tolerance of 1e-9."""
+    problems: dict[str, Problem] = {}
+    kinds = {
+        "free rows": (Cones.free(4), "coulomb"),
+        "limits": (Cones.bounded(np.zeros(5), np.full(5, np.inf)), "coulomb"),
+        "contacts, law coulomb": (Cones.contacts([0.3, 0.7], 2), "coulomb"),
+        "contacts, law cone": (Cones.contacts([0.3, 0.7], 2), "cone"),
+    }
+    for kind, (cones, friction) in kinds.items():
+        rng = np.random.default_rng(1)
+        basis, _ = np.linalg.qr(rng.normal(size=(8, 8)))
+        mass = basis @ np.diag(np.geomspace(1.0, 1e10, 8)) @ basis.T
+        jac = rng.normal(size=(cones.n_rows, 8))
+        problems[f"{kind} of an ill-conditioned mass matrix"] = Problem.from_jacobian(
+            jac, 0.5 * (mass + mass.T), rng.normal(size=8), cones=cones, friction=friction
+        )
+    return problems
+
+
+#: Problems that not all checks use, by the word of `Check.problems`.
+GROUPS = {
+    "large": make_large_problems,
+    "unsolvable": make_unsolvable_problems,
+    "jammed": make_jammed_problems,
+    "ill-conditioned": make_ill_conditioned_problems,
+}
+
+
 def change_numbers(problem: Problem) -> Problem:
     """Return a problem of the same structure with another A, b, bounds and coefficients."""
     cones, m = problem.cones, problem.m
@@ -216,5 +316,5 @@ def make_problems() -> dict[str, Problem]:
         **make_kinds_of_blocks(),
         EMPTY: Problem.lcp(np.zeros((0, 0)), []),
         INFEASIBLE: Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0], name=INFEASIBLE),
-        **make_large_problems(),
+        **{name: problem for make in GROUPS.values() for name, problem in make().items()},
     }

@@ -28,8 +28,13 @@ class ForeignSolver(Solver):
     def run(
         self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        """Run the solver; a claim of too many iterations becomes a claim of NUMERICAL_ERROR."""
-        claim = self.solver.run(state, impulse, max_iter, tol, time_limit)
+        """Run the solver; a claim of too many iterations becomes a claim of NUMERICAL_ERROR.
+
+        The solver gets a copy of the iterate: if its state keeps a view of it, a later run cannot change the result.
+        """
+        iterate = impulse.copy()
+        claim = self.solver.run(state, iterate, max_iter, tol, time_limit)
+        impulse[:] = iterate
         if claim.iterations > max_iter:
             message = (
                 f"solver {self.name!r} claims the iterations {claim.iterations}; "

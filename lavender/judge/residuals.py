@@ -411,16 +411,21 @@ def combine_best_islands(
     impulses: Sequence[FloatArray],
     tol: float,
     by_energy: bool = False,
+    is_long: bool = False,
 ) -> FloatArray:
     """Return the best of a start and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
 
     An impulse replaces the start if it solves the island, if its objective is lower (symmetric A, bounded rows or
-    cones), or if its energy error is lower (Coulomb's law, asymmetric A, or `by_energy`).
+    cones), or if its energy error is lower (Coulomb's law, asymmetric A, or `by_energy`). The same holds, with
+    `is_long`, for the islands that seem to have no solution after a long or failed run that ended at the last impulse.
     """
     get_zero_impulse_reference(problem)
     best = measure.BestImpulse(problem.metric, start, tol, by_energy)
     for impulse in impulses:
         best.store(impulse)
+    if is_long and impulses:
+        other = combine_best_islands(problem, start, impulses, tol, by_energy=True)
+        return cast("FloatArray", best.replace_growing_islands(impulses[-1], other))
     return cast("FloatArray", best.impulse)
 
 

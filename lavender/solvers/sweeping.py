@@ -38,9 +38,20 @@ SWEEP_PATIENCE = (
 
 
 def create_stopping_test(
-    problem: Problem, data: Any, patience: int, keeps_last: bool = False
+    problem: Problem, data: Any, patience: int = SWEEP_PATIENCE, keeps_last: bool = False
 ) -> StoppingTest:
-    """Create the stopping test of a run over `data`. If A was formed from J and M, the test is confirmed on J and M."""
+    """Create the stopping test of a run over `data`, such as `problem.csr_data`, for solvers in Cython and Python.
+
+    A solver in Python calls `watch.run_python(iterate, impulse, n, tol)`: it calls `iterate(count, first)` between
+    checks by the judge and returns a status, for `make_claim`, and the number of iterations. As `watch` of the state of
+    a solver, the test also keeps the impulse that the solve returns. If A was formed from J and M, the test is
+    confirmed on J and M. A run stops as STALLED after `patience` iterations without a smaller residual at a check.
+    """
+    if problem.metric.reference_energy < 0.0:
+        get_zero_impulse_reference(problem)
+    data.share_reference(
+        problem.metric
+    )  # Make residuals over `data` relative to the judge's reference.
     formed = problem.matrix is None and not (data.factored or data.is_general)
     return StoppingTest(data, patience, problem.metric if formed else None, keeps_last)
 
@@ -62,11 +73,6 @@ class SweepState:
         self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
         # `plan` is the order in terms of the problem's blocks; `order` may be replaced.
         self.order = self.plan = order
-        if problem.metric.reference_energy < 0.0:
-            get_zero_impulse_reference(problem)
-        data.share_reference(
-            problem.metric
-        )  # Make residuals over `data` relative to the judge's reference.
         self.watch = create_stopping_test(problem, data, patience, keeps_last)
         # lavender_ext.sweep.serial.Sweeps with these options; by default, relaxed updates of the blocks.
         self.sweeps = (
@@ -84,9 +90,9 @@ class SweepState:
         return float(self.watch.sweeps_per_decade)
 
 
-def make_claim(status: int, done: int) -> Claim:
-    """Return the claim for the status code and the number of sweeps that a kernel returned."""
-    return Claim(STATUS[status], done, {"sweeps": done})
+def make_claim(status: int, done: int, counted: str = "sweeps") -> Claim:
+    """Return the claim for the status code and the number of iterations that a stopping test returned."""
+    return Claim(STATUS[status], done, {counted: done})
 
 
 def make_order_plan(order: Order) -> tuple[Any, ...]:

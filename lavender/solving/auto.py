@@ -232,7 +232,7 @@ class FirstSweeps:
                 share = 1.0
                 loop.deadline = deadline
                 claim = loop.run_chunks(max_iter)
-        loop._keep_best()
+        loop._keep_best(claim)
         self.claim = claim
         judged = reuse_or_judge_impulse(problem, impulse, loop.judged)
         if not judged.relative <= max(tol, self.before):  # Sweeps may raise the error.

@@ -24,6 +24,7 @@ from lavender.judge.residuals import (
     reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
+    DIVERGED,
     INTERRUPTED,
     MAX_ITERATIONS,
     NUMERICAL_ERROR,
@@ -37,7 +38,7 @@ from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.registry import State
 from lavender_ext.judge.measure import are_bit_identical
-from lavender_ext.judge.stopping_test import StoppingTest
+from lavender_ext.judge.stopping_test import LONG_RUN_SWEEPS, StoppingTest
 
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
 # Largest number of iterations of the first chunk: at 40 us per iteration, as of solvers in Python, it takes 10 ms.
@@ -111,7 +112,7 @@ class Loop:
         """Run in chunks; the result is the best of the iterates that the solver has checked."""
         claim = self.run_chunks(max_iter)
         if self.tol != 0.0:  # With tol = 0, the result is the last iterate.
-            self._keep_best()
+            self._keep_best(claim)
         return claim
 
     def run_chunks(self, max_iter: int) -> Claim:
@@ -174,12 +175,16 @@ class Loop:
         left = None if self.deadline is None else self.deadline.get_remaining_seconds()
         return CHUNK_TIME if left is None else min(LIMITED_CHUNK_TIME, left)
 
-    def replace_by_best_impulse(self, start: FloatArray) -> None:
+    def _is_long(self, claim: Claim) -> bool:
+        """Return whether impulses that still grow at the end of a run may grow without end."""
+        return claim.status in (DIVERGED, STALLED) or self.done >= LONG_RUN_SWEEPS
+
+    def replace_by_best_impulse(self, start: FloatArray, claim: Claim) -> None:
         """Replace a result that does not meet tol by the best of result and start in each island."""
         problem = self.problem
         result = reuse_or_judge_impulse(problem, self.impulse, self.judged)
         if result.relative > self.tol:
-            result = select_best_impulse(problem, result, start, self.tol)
+            result = select_best_impulse(problem, result, start, self.tol, self._is_long(claim))
         self.judged = result
         self.impulse[:] = result.impulse
 
@@ -190,8 +195,8 @@ class Loop:
             self.impulse[:] = combine_best_islands(problem, self.impulse, (), self.tol)
         self.judged = judge_impulse(problem, self.impulse.copy())
 
-    def _keep_best(self) -> None:
-        """Replace the last iterate by the best checked iterate."""
+    def _keep_best(self, claim: Claim) -> None:
+        """Replace the last iterate by the best checked iterate; a state's `best` that is no impulse does not count."""
         state: State = self.state
         watch = getattr(state, "watch", None)
         if isinstance(watch, StoppingTest):
@@ -201,9 +206,16 @@ class Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
+        checked = np.asarray(best[1])
+        is_impulse = checked.shape == self.impulse.shape and checked.dtype.kind in "iuf"
+        if not is_impulse or not np.isfinite(checked).all():
+            return
+        checked = checked.astype(float)
         self.judged = reuse_or_judge_impulse(self.problem, self.impulse, self.judged)
         if self.judged.relative > self.tol:
-            self.impulse[:] = combine_best_islands(self.problem, best[1], (self.impulse,), self.tol)
+            self.impulse[:] = combine_best_islands(
+                self.problem, checked, (self.impulse,), self.tol, is_long=self._is_long(claim)
+            )
 
     def _record_residual(self) -> bool:
         """Record the residual and call the callback; return whether the callback stops the solve."""
@@ -248,8 +260,10 @@ class Loop:
         )
 
 
-def select_best_impulse(problem: Problem, result: Any, start: FloatArray | None, tol: float) -> Any:
-    """Return the judged best of `result` and the start (m,) in each island.
+def select_best_impulse(
+    problem: Problem, result: Any, start: FloatArray | None, tol: float, is_long: bool = False
+) -> Any:
+    """Return the judged best of `result` and the start (m,) in each island; `is_long` as in `combine_best_islands`.
 
     A result that meets tol, or is at its round-off floor, is returned unchanged. An impulse outside its bounds is
     projected first.
@@ -262,5 +276,5 @@ def select_best_impulse(problem: Problem, result: Any, start: FloatArray | None,
         inside = project_impulse(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
-    best = combine_best_islands(problem, first, (own,), tol)
+    best = combine_best_islands(problem, first, (own,), tol, is_long=is_long)
     return result if are_bit_identical(best, result.impulse) else judge_impulse(problem, best)

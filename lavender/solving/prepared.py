@@ -498,7 +498,7 @@ class Prepared:
         checked = has_checks and loop.state.watch.has_best
         if not keeps_best and not checked and (claim.status is TIME_LIMIT or not has_checks):
             claimed = loop.impulse.copy()
-            loop.replace_by_best_impulse(start)
+            loop.replace_by_best_impulse(start, claim)
             if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
                 relative = measure_residual(problem, claimed).relative
                 if relative > loop.tol:

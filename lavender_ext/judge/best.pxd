@@ -189,6 +189,15 @@ cdef inline bint runs_up_to_bound(const blocks_t* p, int32_t island, const doubl
     return False
 
 
+cdef inline bint seems_without_solution(const best_t* s, const blocks_t* p, int32_t island, double relative, double energy,
+                                        const double* lam, const double* w) noexcept nogil:
+    """Return whether an island seems to have no solution after a long or failed run that ends at lam (m), slack w (m).
+
+    relative and energy are the errors of the impulse that would be returned.
+    """
+    return relative > 1.0 and s.begin_energy[island] < energy and not runs_up_to_bound(p, island, lam, w)
+
+
 cdef inline void restore_best_islands(best_t* s, const view_t* v, const double* w, double* lam, double tol, bint keeps_last,
                                       bint is_long) noexcept nogil:
     """Replace lam (m), scored in `now`, with slack w (m), by the best impulse, or with `keeps_last` (2) by the last one.
@@ -199,8 +208,8 @@ cdef inline void restore_best_islands(best_t* s, const view_t* v, const double* 
     cdef bint last
     for i in range(s.n):
         last = keeps_last and not s.relative[i] <= tol and s.now[2 * i] < INFINITY and not minimises_objective(s, v, i)
-        if is_long and (s.now[2 * i] if last else s.relative[i]) > 1.0 and s.begin_energy[i] < (
-                s.now[2 * i + 1] if last else s.energy[i]) and not runs_up_to_bound(&v.p, i, lam, w):
+        if is_long and seems_without_solution(s, &v.p, i, s.now[2 * i] if last else s.relative[i],
+                                              s.now[2 * i + 1] if last else s.energy[i], lam, w):
             copy_island_impulse(&v.p, i, s.begin, lam)
         elif not last:
             copy_island_impulse(&v.p, i, s.impulse, lam)

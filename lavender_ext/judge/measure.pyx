@@ -17,8 +17,9 @@ from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
 from lavender_ext.core.start cimport is_zero_impulse
-from lavender_ext.judge.best cimport (begin_at_better_point, best_workspace_size, best_t, bind_best, count_islands,
-                                      copy_score_without_islands, store_better_islands, store_start)
+from lavender_ext.judge.best cimport (begin_at_better_point, best_workspace_size, best_t, bind_best, copy_island_impulse,
+                                      copy_score_without_islands, count_islands, seems_without_solution,
+                                      store_better_islands, store_start)
 from lavender_ext.judge.forms cimport (compute_csr_slack, judge_impulse_over_bodies, judge_impulse_over_generalized,
                                        score_generalized_slack)
 from lavender_ext.judge.measure cimport (residual_above_floor, set_zero_impulse, relative_floor_of_score,
@@ -493,6 +494,24 @@ cdef class BestImpulse:
             lam = as_double_pointer(impulse, m)
             self.judge(lam)
             store_better_islands(&self.best, &self.v, lam, self.slack(), self.tol)
+
+    def replace_growing_islands(self, last, other):
+        """Return the best impulse (m,) [N s], and `other` (m,) in islands that seem to have no solution.
+
+        They are those of `seems_without_solution` in judge/best.pxd; `last` (m,) is the impulse at the end of the run.
+        """
+        cdef int32_t i
+        cdef const double* lam
+        cdef const double* replacement
+        cdef double[::1] result = self.impulse
+        if self.p.blocks.n_rows:
+            lam, replacement = as_double_pointer(last, self.p.blocks.n_rows), as_double_pointer(other, self.p.blocks.n_rows)
+            self.judge(lam)
+            for i in range(self.best.n):
+                if seems_without_solution(&self.best, &self.p.blocks, i, self.best.relative[i], self.best.energy[i], lam,
+                                          self.slack()):
+                    copy_island_impulse(&self.p.blocks, i, replacement, &result[0])
+        return np.asarray(result)
 
     @property
     def impulse(self):

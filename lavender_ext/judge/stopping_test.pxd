@@ -38,8 +38,11 @@ cpdef enum:
     AT_FLOOR = 4
 
 
-cdef enum:
+cpdef enum:
     LONG_RUN_SWEEPS = 64        # After so many sweeps, impulses that still grow may grow without end (best.pxd).
+
+
+cdef enum:
     N_EARLY_SWEEPS = 8          # Residuals of these sweeps may rise, because the zero impulse is nearly a solution.
 
 

@@ -2,14 +2,17 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import lavender as lv
 from lavender import contract
+from lavender.base.arrays import check_float
 from lavender.contract.checks import find_failure
 from lavender.problem.cones import CONTACT_BOX, ROW
+from lavender.solvers.sweeping import create_stopping_test, make_claim
 
 
 @dataclass
@@ -19,6 +22,7 @@ class State:
     b: np.ndarray
     cones: lv.Cones
     done: int = 0
+    watch: object = None
     step: dict[int, float] = field(
         default_factory=dict
     )  # [kg] Steps of friction components by their first row.
@@ -113,6 +117,15 @@ class Sweeps:
         return judged.relative / (5.0 if self.mistake == "stops at five times tol" else 1.0)
 
     def run(self, state, x, n, tol, time_limit=None):
+        if not self.mistake:  # Without a mistake, the package's stopping test ends a run.
+            state.watch = state.watch or create_stopping_test(state.problem, state.problem.csr_data)
+
+            def iterate(count, first):
+                for _ in range(count):
+                    self.sweep(state, x)
+                    state.done += 1
+
+            return make_claim(*state.watch.run_python(iterate, x, n, tol))
         if self.mistake == "ignores the start" and not state.done:
             x[:] = state.problem.start()
         if self.mistake == "fails without a message":
@@ -274,6 +287,9 @@ def find_unmet(register, monkeypatch):
 def test_contract_finds_a_solver_with_one_mistake(mistake, find_unmet):
     failure = find_unmet(mistake)
     assert failure and "raised in" not in failure, failure
+    assert not failure.startswith(
+        "rounding"
+    )  # Only the solver without a mistake has the stopping test.
 
 
 def test_contract_is_met_by_the_solver_without_a_mistake(find_unmet):
@@ -373,3 +389,140 @@ def test_checks_apply_to_listed_capabilities_only():
     names = {check.name for check in contract.list_checks(spec)}
     assert not names & {"orders_change_the_sweep", "interruptions_return_the_iterate"}
     assert "problems_are_solved" in names
+
+
+# -- what the tests of all registered solvers require ------------------------------------------------------
+
+
+class Barzilai:
+    """Projected gradient with Barzilai-Borwein steps, whose own test reads the residual every ten iterations.
+
+    It solves every solvable problem, and runs away on others: its objective falls without end.
+    """
+
+    def __init__(self, growth=1e6):
+        self.growth = growth if self.is_silent else check_float("growth", growth, above=0.0)
+
+    is_silent = False
+
+    def prepare(self, problem):
+        A = problem.csr
+        step = 1.0 / float((abs(A).sum(axis=1) / problem.d).max(initial=1.0))
+        return SimpleNamespace(p=problem, A=A, done=0, best=(np.inf, None), step=step)
+
+    def run(self, s, x, n, tol, time_limit=None):
+        p = s.p
+        for i in range(n):
+            if tol > 0.0 and s.done % 10 == 0:
+                relative = lv.residual(p, x).relative
+                if relative < s.best[0]:
+                    s.best = relative, x.copy()
+                if not tol < relative < 1e12:
+                    status = lv.Status.CONVERGED if relative <= tol else lv.Status.DIVERGED
+                    return lv.Claim(status, i, {"products": 2 * i}, "it grew" * (relative > tol))
+            new = np.clip(x - s.step * (s.A @ x - p.b) / p.d, p.cones.lower, p.cones.upper)
+            change = new - x
+            curvature = float(change @ (s.A @ change))
+            if curvature > 0.0:
+                s.step = min(float(change @ (p.d * change)) / curvature, 1e6)
+            x[:] = new
+            s.done += 1
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"products": 2 * n})
+
+
+BARZILAI = lv.SolverSpec(
+    "barzilai",
+    Barzilai,
+    laws=ROWS,
+    operators=frozenset({"matrix"}),
+    options={"growth": "largest step"},
+    refusal=lambda p: None if p.is_symmetric else "needs a symmetric A",
+    summary="Barzilai-Borwein",
+)
+
+
+def find_failures(register, spec):
+    register(spec)
+    failures = {check.name: find_failure(spec, check).text for check in contract.list_checks(spec)}
+    return {name: text for name, text in failures.items() if text}
+
+
+def test_contract_finds_a_solver_that_passes_every_solvable_problem(register):
+    failures = find_failures(register, BARZILAI)
+    assert "growth=1000000.0 and growth=500000.0 give" in failures["options_change_the_iterates"]
+    assert "islands" in failures["islands_are_solved_next_to_an_island_without_a_solution"]
+    assert "ROUNDOFF_LIMIT" in failures["rounding_ends_a_solve"]
+    assert "problems_are_solved" not in failures and "budgets_are_kept" not in failures
+
+
+def test_results_of_a_registered_solver_without_a_solution_are_not_worse_than_zero(register):
+    """The iterate with the smallest E counts after a long or failed run, as from the package's own solvers."""
+    register(BARZILAI)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(2, 5))
+        limit = rng.normal(size=(1, n))
+        J = np.vstack([rng.normal(size=(2, n)), limit, -limit])
+        problem = lv.Problem.lcp(J @ J.T, np.array([0.0, 0.0, 5.0, 5.0]) - J @ rng.normal(size=n))
+        found = lv.solve(problem, "barzilai")
+        assert found.residual.energy <= found.residual.energy_at_zero * (1.0 + 1e-12)
+
+
+def test_contract_finds_options_with_any_value(register, monkeypatch):
+    monkeypatch.setattr(Barzilai, "is_silent", True)
+    text = find_failures(register, BARZILAI)["wrong_values_of_options_raise"]
+    assert text.startswith("for ") and "growth='no such word' was accepted" in text
+
+
+def test_contract_finds_packages_that_a_file_imports_at_its_top(register, tmp_path, monkeypatch):
+    (tmp_path / "heavy_solver.py").write_text(
+        "import numpy\nfrom scipy import sparse\nclass Heavy:\n    def __init__(self):\n        pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spec = replace(BARZILAI, factory=__import__("heavy_solver").Heavy, options={})
+    register(spec)
+    check = contract.CHECKS["the_file_imports_numpy_alone"]
+    assert not check.applies(spec)  # Only a plug-in with an entry point is read by every command.
+    object.__setattr__(spec, "distribution", "heavy")
+    assert check.applies(spec)
+    text = find_failure(spec, check).text
+    assert "heavy_solver.py, line 2 imports scipy" in text
+
+
+class Keeping(Barzilai):
+    """It keeps a view of the iterate, and writes into it in the next solve."""
+
+    kept = ()
+
+    def prepare(self, problem):
+        for view in self.kept:
+            view[:] = np.nan
+        return super().prepare(problem)
+
+    def run(self, s, x, n, tol, time_limit=None):
+        Keeping.kept = (*self.kept, x[:])
+        return super().run(s, x, n, tol, time_limit)
+
+
+def test_solver_that_keeps_a_view_of_the_iterate_changes_no_solution(register):
+    register(replace(BARZILAI, factory=Keeping))
+    problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+    prepared = lv.prepare(problem, "barzilai")
+    first = prepared.solve()
+    before = first.impulse.copy()
+    prepared.solve()
+    np.testing.assert_array_equal(first.impulse, before)
+    assert first.success
+
+
+@pytest.mark.parametrize("best", [[np.nan, 0.0], [1.0], [[0.5, 0.0]], "none", None])
+def test_best_iterate_that_is_no_impulse_does_not_count(register, best):
+    class Wrong(Barzilai):
+        def run(self, s, x, n, tol, time_limit=None):
+            x[:] = [0.4, 0.0]
+            s.best = 0.0, best
+            return lv.Claim(lv.Status.MAX_ITERATIONS, n, {"products": n})
+
+    register(replace(BARZILAI, factory=Wrong))
+    found = lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0]), "barzilai")
+    np.testing.assert_array_equal(found.impulse, [0.4, 0.0])

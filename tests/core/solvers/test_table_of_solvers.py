@@ -9,13 +9,13 @@ TOY = """
 '''Projected Richardson iteration: lambda <- clip(lambda - omega w, lower, upper), omega = 1 / max_i sum_j |A_ij|.'''
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
 from lavender.base.arrays import check_float
-from lavender.judge.residuals import residual
-from lavender.judge.solution import Claim, Status
 from lavender.solvers.registry import Solver, SolverSpec
+from lavender.solvers.sweeping import create_stopping_test, make_claim
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,19 @@ class Toy(Solver):
         check_float("damping", self.damping, above=0.0)
 
     def prepare(self, problem):
-        return problem, self.damping / max(abs(problem.csr).sum(axis=1).max(initial=0.0), 1e-300)
+        omega = self.damping / max(abs(problem.csr).sum(axis=1).max(initial=0.0), 1e-300)
+        watch = create_stopping_test(problem, problem.csr_data)
+        return SimpleNamespace(problem=problem, omega=omega, watch=watch)
 
     def run(self, state, impulse, max_iter, tol, time_limit=None):
-        problem, omega = state
-        for done in range(max_iter + 1):
-            if tol > 0.0 and residual(problem, impulse).relative <= tol:
-                return Claim(Status.CONVERGED, done, {"sweeps": done})
-            if done < max_iter:
+        problem, cones = state.problem, state.problem.cones
+
+        def iterate(count, first):
+            for _ in range(count):
                 w = problem.csr @ impulse - problem.b
-                impulse[:] = np.clip(impulse - omega * w, problem.cones.lower, problem.cones.upper)
-        return Claim(Status.MAX_ITERATIONS, max_iter, {"sweeps": max_iter})
+                impulse[:] = np.clip(impulse - state.omega * w, cones.lower, cones.upper)
+
+        return make_claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
 
 
 SPEC = SolverSpec(
@@ -71,7 +73,7 @@ assert lv.available(external=False)[-1] == "toy" and lv.get("toy").builtin and n
 
 from lavender.contract import check_solver
 found = {check.name: failure.text for check, failure in check_solver("toy")}
-assert len(found) >= 6 and not any(found.values()), found
+assert len(found) >= 13 and not any(found.values()), found
 
 lines = lv.report.run(["stack(n=8)"], ["toy", "pgs"], lv.report.Plan(tolerances=(1e-2,), budgets=(4,), repeats=1))
 report = lv.report.Report(lines)
