@@ -22,6 +22,7 @@ Submodules and the engine are imported at their first use.
 import sys
 from typing import TYPE_CHECKING
 
+import lavender.base.check_build  # noqa: F401 - first: it explains why kernels cannot be imported
 from lavender._version import __version__
 from lavender.base.errors import (
     CapabilityError,

@@ -52,6 +52,10 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
     processor, and are copied once if they are on another device.
     """
     if not hasattr(value, "__dlpack__") or isinstance(value, np.ndarray):
+        if get_labels(value) is not None:
+            raise InputError(
+                f"{name} is a {type(value).__name__} whose index would be ignored: sort it, and give {name}.to_numpy()"
+            )
         try:
             return np.asarray(value)
         except (TypeError, ValueError) as error:
@@ -84,6 +88,15 @@ def to_numpy(name: str, value: Any) -> np.ndarray:
     raise InputError(
         f"{name} is a {kind} on device {device} that cannot be read ({reason}): copy it to the host"
     )
+
+
+def get_labels(value: Any) -> list[Any] | None:
+    """Return the labels of the rows of a pandas Series or DataFrame; None for other values, and for 0, 1, 2, ..."""
+    if isinstance(value, np.ndarray) or type(value).__module__.partition(".")[0] != "pandas":
+        return None
+    index = getattr(value, "index", None)
+    labels = [] if index is None or callable(index) else list(index)
+    return None if labels == list(range(len(labels))) else labels
 
 
 def as_array(

@@ -6,15 +6,16 @@ by a single `solve`. A `Solution` is built at its first access.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_int, mark_read_only
+from lavender.base.arrays import FloatArray, check_int, format_html_table, mark_read_only
 from lavender.base.deadline import NEVER, Deadline
-from lavender.base.errors import InputError, LavenderError
+from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.batch.data import Batch
 from lavender.batch.residuals import (
     WorldResults,
@@ -255,6 +256,49 @@ class Solutions(WorldResults, Sequence[Solution]):
                 f"{judgement.relative:.2e}): the arrays of world {i} were written over after the solve"
             )
         return fields
+
+    def to_pandas(self) -> Any:
+        """Return a pandas DataFrame with a row for each world: its status, success and the numbers of the judge.
+
+        The columns are `status`, `success`, `iterations`, `relative` [-], `energy` [sqrt J], `velocity_error` [m/s or
+        rad/s], `impulse_error` [N s], `roundoff_floor` [-] and `worst_row`, its name or "" without one.
+        """
+        require_packages("Solutions.to_pandas", "pandas")
+        import pandas as pd
+
+        worst = np.asarray(self._worlds.worst[:-1]) if len(self) else np.zeros(0, int)
+        names = [
+            "" if i in self.faults or row < 0 else self.problems[i].row_name(int(row))
+            for i, row in enumerate(worst)
+        ]
+        columns: dict[str, Any] = {
+            "status": [status.name for status in self.status],
+            "success": self._is_solved,
+            "iterations": self._worlds.counts[:-1, 0],
+            "relative": self._get_column("relative"),
+            "energy": self._get_column("energy"),
+            "velocity_error": self._get_column("speed"),
+            "impulse_error": self._get_column("push"),
+            "roundoff_floor": self._get_column("roundoff_floor"),
+            "worst_row": names,
+        }
+        return pd.DataFrame(columns)
+
+    def _repr_html_(self) -> str:
+        """Return a small HTML table for notebooks: counts of statuses, and the worst world."""
+        counts = Counter(status.name for status in self.status)
+        relative = np.where(
+            np.isnan(self._get_column("relative")), -1.0, self._get_column("relative")
+        )
+        facts = {
+            "worlds": len(self),
+            "solved": f"{int(self._is_solved.sum())} to {self.tol:g}",
+            "statuses": ", ".join(f"{name} {n}" for name, n in counts.most_common()),
+        }
+        if len(self) and relative.max() >= 0.0:
+            i = int(relative.argmax())
+            facts |= {"worst world": f"{i}, relative residual {relative[i]:.2e}"}
+        return format_html_table(facts, self._spec.name)
 
     def __repr__(self) -> str:
         return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self._is_solved.sum())} to {self.tol:g}>"

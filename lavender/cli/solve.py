@@ -120,7 +120,7 @@ def solve(
         }
         click.echo(format_json(results, indent=1))
     else:
-        start = "zero impulses" if item.problem.guess is None else "the stored impulses"
+        start = "zero impulses" if item.problem.guess is None else "the stored guess"
         kind = f"{item.problem.law}, {item.problem.m} rows, starts from {start}"
         if (qp := item.problem.qp) is not None:
             kind = f"quadratic program, {len(qp.q)} variables, {len(qp.target)} rows"

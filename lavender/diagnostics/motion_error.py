@@ -99,8 +99,10 @@ class MotionError:
             for name, x, unit, where in numbers
             if x is not None
         ]
-        text = f"motion error: {', '.join(parts)}; reference: {self.reference_residual}"
-        return f"{text}; {self.note}" if self.note else text
+        text = f"motion error: {', '.join(parts)}".rstrip(" :")
+        text = f"{text}: {self.note}" if not parts and self.note else text
+        text = f"{text}; reference: {self.reference_residual}"
+        return f"{text}; {self.note}" if self.note and parts else text
 
 
 def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
@@ -158,7 +160,11 @@ def _compute_error(problem: Problem, x: FloatArray, reference: FloatArray) -> Mo
     values |= {"body": -1, "spin_body": -1, "row": -1}
     notes = []
     if not (judged.relative <= REFERENCE_MAX_RESIDUAL or judged.at_floor):
-        notes.append("the reference is not a solution, so there is no estimate")
+        notes.append(
+            f"no estimate, because the relative residual {judged.relative:.1e} of the reference is above "
+            f"{REFERENCE_MAX_RESIDUAL:.0e} and above twice its floor {judged.roundoff_floor:.1e}: a solution to "
+            f"tol={REFERENCE_MAX_RESIDUAL:.0e} is needed as reference"
+        )
     else:
         delta = x - reference
         velocity, *energies = _compute_motion(problem, delta)

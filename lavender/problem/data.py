@@ -23,6 +23,7 @@ from lavender.base.arrays import (
     check_nonnegative_magnitudes,
     check_unmasked,
     format_html_table,
+    get_labels,
     get_shape,
     mark_read_only,
 )
@@ -283,7 +284,8 @@ class ProblemData:
         Parameters
         ----------
         impulse : (m,) N s, Solution, or (Problem, impulse)
-            Impulses of an earlier problem are assigned to the blocks by their keys (`carry`).
+            Impulses of an earlier problem are assigned to the blocks by their keys (`carry`). A pandas Series is
+            aligned by its index, which has the numbers or the names of all rows (`row_name`).
         name : str
             Name of the argument in messages.
         finite : bool
@@ -307,6 +309,8 @@ class ProblemData:
         )
         if is_pair or (hasattr(impulse, "impulse") and hasattr(impulse, "residual")):
             return self.carry(impulse)
+        if (labels := get_labels(impulse)) is not None:
+            impulse = self._align_by_row(name, impulse, labels)
         shape = get_shape(name, impulse)
         if len(shape) == 1 and shape != self.b.shape and name == "impulse":
             raise InputError(
@@ -317,6 +321,26 @@ class ProblemData:
         if finite:
             check_finite(f"{name} [N s]", array)
         return array.copy()
+
+    def _align_by_row(self, name: str, series: Any, labels: Sequence[Any]) -> np.ndarray:
+        """Return the numbers of a pandas Series in the order of the rows, by its labels: numbers or names of rows."""
+        values, places = np.asarray(series), {label: i for i, label in enumerate(labels)}
+        names = [self.row_name(i) for i in range(self.m)]
+        for wanted in (range(self.m), names):
+            if len(places) == len(labels) == self.m == len(set(wanted)) and all(
+                label in places for label in wanted
+            ):
+                return values[[places[label] for label in wanted]]
+        unknown = [x for x in labels if x not in names and x not in range(self.m)]
+        reason = (
+            f"the label {unknown[0]!r}, which is no row"
+            if unknown
+            else "no label, or two, for a row"
+        )
+        raise InputError(
+            f"{name} [N s] is a {type(series).__name__} whose index has {reason}; the numbers 0 to {self.m - 1} or the "
+            f"names of all rows are needed, such as {names[0] if names else 'row 0'!r} (problem.row_name), or an array"
+        )
 
     # -- names -----------------------------------------------------------------------------------
 

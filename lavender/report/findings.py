@@ -32,6 +32,7 @@ from lavender.report.text import (
 )
 from lavender.report.text import format_tolerance as format_tol
 from lavender.report.timing import format_call
+from lavender.solvers import registry
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -692,12 +693,7 @@ def write(
     if "solvers" in report.sections and len(report.ranked_runs):
         files["tables/matrix.csv"] = lambda: tables.tabulate_matrix(report)
         files["tables/solvers.tex"] = lambda: make_latex_table(report)
-        files[
-            "tables/lavender.bib"
-        ] = (  # The entry of BibTeX that cites the version which made the report.
-            f"@software{{lavender, author = {{{{{AUTHOR}}}}}, title = {{{{{TITLE}}}}}, "
-            f"version = {{{report.machine['lavender']}}}, year = {{{report.machine['started'][:4]}}}}}\n"
-        )
+        files["tables/lavender.bib"] = make_bibliography(report)
     files["summary.md"] = lambda: summarise(report)
     drawn = FigureFolder(folder / "figures", report.figure_kinds)
     files["index.html"] = lambda: report.make_page(drawn, figures).render()
@@ -706,6 +702,37 @@ def write(
         folder, files, lambda name: watch(Event(order[name], len(files), name, "", phase="writing"))
     )
     return folder / "index.html"
+
+
+def make_bibliography(report: Report) -> str:
+    """Return entries of BibTeX: the lavender that made the report, and each solver that was compared, with its URL."""
+    software = {
+        "author": f"{{{AUTHOR}}}",
+        "title": f"{{{TITLE}}}",
+        "version": report.machine["lavender"],
+        "year": report.machine["started"][:4],
+    }
+    entries = [("software", "lavender", software)]
+    for name in report.ranking.index:
+        spec = registry.specs().get(str(name))
+        if spec is None:
+            continue  # The user's engine, or a plug-in that is not installed here.
+        title = _escape_latex(f"{spec.name}: {spec.summary}")
+        fields = {"title": f"{{{title}}}", "note": _escape_latex(spec.reference)}
+        if spec.external:
+            package = spec.install.split()[0]
+            near = re.search(r"\((\S+)\)", spec.install)
+            version = report.machine.get("versions", {}).get(package, "")
+            url = f"https://{near[1]}" if near else f"https://pypi.org/project/{package}/"
+            fields |= {"url": url, "version": version}
+        elif spec.builtin:
+            fields |= {"howpublished": f"lavender {report.machine['lavender']}, \\cite{{lavender}}"}
+        entries.append(("misc", spec.name, fields))
+    texts = []
+    for kind, key, fields in entries:
+        lines = [f"  {word} = {{{text}}}" for word, text in fields.items() if text]
+        texts.append(f"@{kind}{{{key},\n" + ",\n".join(lines) + "\n}\n")
+    return "\n".join(texts)
 
 
 def make_latex_table(report: Report) -> str:

@@ -46,3 +46,16 @@ def test_repr_html_has_the_numbers_of_a_result(problem, solution):
     assert floor in solution._repr_html_() and floor in solution.residual._repr_html_()
     html = lv.cross_check(problem, ["direct", "pgs"])._repr_html_()
     assert html.count("<tr") == 3 and "agrees" in html
+
+
+def test_solutions_as_a_table_of_pandas_and_of_html_have_the_numbers_of_each_world(problem):
+    bad = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [2.0, -1.0])
+    many = lv.solve_many([problem, bad, problem], "pgs")
+    table = many.to_pandas()
+    assert list(table["status"]) == [s.name for s in many.status] and len(table) == 3
+    for name in ("relative", "energy", "velocity_error", "roundoff_floor", "iterations", "success"):
+        np.testing.assert_array_equal(table[name], getattr(many, name))
+    assert list(table["worst_row"]) == [many[i].residual.worst_name for i in range(3)]
+    html = many._repr_html_()
+    assert "1, relative residual" in html and "2 to 1e-06" in html and "STALLED 1" in html
+    assert len(lv.solve_many([], "pgs").to_pandas()) == 0

@@ -121,3 +121,16 @@ def test_measure_motion_of_an_engine_step_equals_motion_error(friction):
         assert info["motion"][key] == pytest.approx(getattr(error, key), rel=1e-6)
     # The plane is body 0 of the scene and no body of the rows.
     assert info["motion"]["body"] == sim.scene.bodies[1 + error.body].name
+
+
+def test_motion_error_without_a_solution_as_reference_names_the_missed_limit():
+    problem = lv.suite.case("box_stack(n=4)").problem
+    for tol in (1e-9, 3e-10, 1e-3):
+        reference = lv.solve(problem, "nncg", tol=tol).impulse
+        relative = lv.residual(problem, reference).relative
+        if relative <= 1e-10:
+            continue
+        error = lv.motion_error(problem, 0.5 * reference, reference)
+        text = str(error)
+        assert error.relative is None and f"{relative:.1e}" in text and "1e-10" in text
+        assert text.startswith("motion error: no estimate") and ": ;" not in text

@@ -137,7 +137,7 @@ def test_entry_of_bibtex_agrees_with_the_citation_file(written):
     )
     entry = (written[1] / "tables" / "lavender.bib").read_text(encoding="utf-8")
     assert f"title = {{{{{title}}}}}" in entry and f"author = {{{{{author}}}}}" in entry
-    assert "version = {0.1}, year = {2026}" in entry
+    assert "version = {0.1},\n  year = {2026}" in entry
 
 
 def test_no_cell_of_a_report_says_nan_or_inf(tmp_path):

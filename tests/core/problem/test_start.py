@@ -1,6 +1,7 @@
 """`impulse=` of every function: an array, a Solution, or a pair of a problem and its impulse."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from random_problems import random_contact_problem
 
@@ -78,3 +79,42 @@ def test_solve_qp_and_batches_start_from_a_result():
     again = lv.solve_many(batch, "pgs", tol=1e-6, impulse=result)
     assert not np.any(again.iterations)
     np.testing.assert_array_equal(again.impulse, result.impulse)
+
+
+LABELLED = [
+    lambda p, x: lv.residual(p, x).relative,
+    lambda p, x: lv.solve(p, "pgs", impulse=x, max_iter=0, tol=0.0).residual.relative,
+    lambda p, x: lv.prepare(p, "pgs").solve(impulse=x, max_iter=0, tol=0.0).residual.relative,
+    lambda p, x: float(lv.residual_many([p], [x]).relative[0]),
+    lambda p, x: lv.motion_error(p, x).relative,
+    lambda p, x: p.energy_change(x),
+]
+
+
+@pytest.mark.parametrize("call", LABELLED)
+def test_series_as_impulse_is_aligned_by_names_or_numbers_of_rows(call):
+    problem = lv.suite.case("box_stack(n=4)").problem
+    x = lv.solve(problem, tol=1e-10).impulse
+    names = [problem.row_name(i) for i in range(problem.m)]
+    shuffled = np.random.default_rng(0).permutation(problem.m)
+    for index in (range(problem.m), names):
+        series = pd.Series(x, index=list(index)).iloc[shuffled]
+        assert call(problem, series) == call(problem, x)
+    for index in (np.arange(problem.m) + 1, ["row"] * problem.m, [*names[1:], "another row"]):
+        with pytest.raises(lv.InputError, match="index"):
+            call(problem, pd.Series(x, index=index))
+
+
+def test_array_with_an_index_that_would_be_ignored_is_refused():
+    b = pd.Series([3.0, 1.0, 2.0])
+    np.testing.assert_array_equal(lv.Problem.lcp(np.eye(3), b).b, b)
+    A = pd.DataFrame(np.eye(3))
+    np.testing.assert_array_equal(lv.Problem.lcp(A, b).dense(), np.eye(3))
+    for make in (
+        lambda: lv.Problem.lcp(np.eye(3), b.sort_values()),
+        lambda: lv.Problem.lcp(A.loc[[2, 0, 1]], b),
+        lambda: lv.solve_qp(np.eye(3), b.sort_values()),
+        lambda: lv.Cones.contacts(b.sort_values()),
+    ):
+        with pytest.raises(lv.InputError, match="whose index would be ignored"):
+            make()

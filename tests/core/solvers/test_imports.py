@@ -1,8 +1,11 @@
 """Modules that an import and a first solve load."""
 
 import json
+import shutil
+import subprocess
+import sys
 
-from worked import python
+from worked import ROOT, python
 
 LOADED = """
 import json, sys
@@ -78,3 +81,22 @@ def test_import_of_the_package_loads_only_needed_modules():
     assert seen["listing"] & HEAVY == set()
     # The order of the table, whoever was asked for first.
     assert names[:3] == ["auto", "direct", "newton"] and own
+
+
+def test_import_of_a_clone_without_kernels_names_the_command_in_three_lines(tmp_path):
+    for name in ("lavender", "lavender_ext"):
+        shutil.copytree(
+            ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "*.pyd", "*.c")
+        )
+    done = subprocess.run(
+        [sys.executable, "-c", "import lavender"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    *_, first, second, third = done.stderr.strip().splitlines()
+    assert first.startswith(
+        f"ImportError: the kernels in {tmp_path / 'lavender_ext'} are not built"
+    )
+    assert f"pip install -e {tmp_path}" in second and "outside of" in third
