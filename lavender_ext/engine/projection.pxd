@@ -1,10 +1,13 @@
 """Position projection: a split impulse that moves bodies and does not change their velocities.
 
-To first order the gap of a contact at the end of the substep is g + h (J v)_n, and the error of a rigid
-joint row C + h J v. Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T p [m, rad] with
+To first order the gap of a contact at the end of the substep is g + h (J v)_n, and to second order the errors of a rigid
+joint are C + h J v + h^2/2 C'' (engine/joints.pxd). Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T p [m, rad]
+with
 
     contact   J s >= -min(beta (g' + slop), push),  p >= 0,  g' = g + h (J v)_n  the predicted gap    (1)
-    joint     J s  = -clip(beta C', push)                                                            (2)
+    joint     J s  = -beta C' min(1, push / |beta C'|),  |.| of the linear and of the angular rows    (2)
+
+A joint is one block of a sweep: (2) is solved for all its rows, so that the shift does not depend on the axes of the world.
 
 Velocities are unchanged, so that the projection adds no kinetic energy. It is skipped if no contact is deeper than
 the slop and no joint has an error.
@@ -17,15 +20,16 @@ MAX_SWEEPS, until
 
 which s = 0 fulfils; without (3) there is no shift.
 """
-from libc.math cimport fabs
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport clip, project_normal_update
-from lavender_ext.core.rows cimport (dot3, apply_joint_impulse, joint_row_velocity, apply_impulse_to_body,
+from lavender_ext.core.block cimport project_normal_update
+from lavender_ext.core.rows cimport (dot3, dot12, apply_joint_impulse, joint_row_velocity, apply_impulse_to_body,
                                      compute_relative_velocity)
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
+from lavender_ext.engine.joints cimport compute_row_curvature
 from lavender_ext.core.vectors cimport scale3
 
 
@@ -33,9 +37,77 @@ cdef enum:
     MAX_SWEEPS = 1000   # largest number of sweeps of one projection without slop
 
 
-cdef inline int32_t is_rigid_joint_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
-    """Return whether a joint row is projected: soft rows correct their own errors, a motor row has no position."""
-    return e.joint[N_JOINT_REAL * i + J_HERTZ] == 0.0 and not (e.joint_motor[i] and row == e.ptr[i + 1] - 1)
+cdef inline int32_t count_projected_rows(const engine_t* e, int32_t i) noexcept nogil:
+    """Return the number of rows of joint i that are projected: a soft joint has none, a motor row has no position."""
+    if e.joint[N_JOINT_REAL * i + J_HERTZ] > 0.0:
+        return 0
+    return e.ptr[i + 1] - e.ptr[i] - e.joint_motor[i]
+
+
+cdef inline double vector_norm(int32_t n, const double* x) noexcept nogil:
+    """Return the Euclidean norm of x (n)."""
+    cdef double s = 0.0
+    cdef int32_t k
+    for k in range(n):
+        s += x[k] * x[k]
+    return sqrt(s)
+
+
+cdef inline double set_joint_goal(const engine_t* e, int32_t i, const double* v, double* goal) noexcept nogil:
+    """Write the shift that joint i requires by (2); return its predicted error [m or rad] at the velocities v (nd, 6)."""
+    cdef int32_t row = e.ptr[i], n = count_projected_rows(e, i), first, count, k
+    cdef double size, correction, h = e.setting[S_H], most = 0.0
+    cdef double curvature[3]
+    if n == 0:
+        return 0.0
+    for k in range(row, row + n):
+        goal[k] = e.joint_error[k] + h * joint_row_velocity(e.jac + 12 * k, v, e.joint_body[2 * i], e.joint_body[2 * i + 1])
+    count = compute_row_curvature(e, i, v, curvature)
+    for k in range(count):
+        goal[row + k] += 0.5 * h * h * curvature[k]
+    first = row
+    while first < row + n:                              # the linear rows, then the angular rows
+        count = n if n < 3 else (3 if first == row else n - 3)
+        size = vector_norm(count, goal + first)
+        most = size if size > most else most
+        correction = e.setting[S_BETA]
+        if correction * size > e.setting[S_MAX_PUSH]:
+            correction = e.setting[S_MAX_PUSH] / size
+        for k in range(first, first + count):
+            goal[k] *= -correction
+        first += count
+    return most
+
+
+cdef inline void project_joint(engine_t* e, int32_t i, const double* goal) noexcept nogil:
+    """Shift the bodies of joint i so that all its rows fulfil (2): the block of A is factored as L D L^T."""
+    cdef int32_t row = e.ptr[i], n = count_projected_rows(e, i), j, k, t
+    cdef int32_t a = e.joint_body[2 * i], b = e.joint_body[2 * i + 1]
+    cdef double low[25]                                 # L below the diagonal
+    cdef double d[5]
+    cdef double inv_d[5]
+    cdef double x[5]
+    cdef double entry
+    for j in range(n):
+        x[j] = goal[row + j] - joint_row_velocity(e.jac + 12 * (row + j), e.shift, a, b)
+        d[j] = dot12(e.jac + 12 * (row + j), e.minv_jac + 12 * (row + j))
+        # A row that the rows before it determine keeps nothing of its own.
+        entry = 1e-12 * d[j]
+        for t in range(j):
+            d[j] -= low[5 * j + t] * low[5 * j + t] * d[t]
+        inv_d[j] = 1.0 / d[j] if d[j] > entry else 0.0
+        for k in range(j + 1, n):
+            entry = dot12(e.jac + 12 * (row + k), e.minv_jac + 12 * (row + j))
+            for t in range(j):
+                entry -= low[5 * k + t] * d[t] * low[5 * j + t]
+            low[5 * k + j] = entry * inv_d[j]
+        for t in range(j):
+            x[j] -= low[5 * j + t] * x[t]
+    for j in range(n - 1, -1, -1):
+        x[j] *= inv_d[j]
+        for k in range(j + 1, n):
+            x[j] -= low[5 * k + j] * x[k]
+        apply_joint_impulse(e.minv_jac + 12 * (row + j), x[j], e.shift, a, b)
 
 
 cdef inline double contact_normal_velocity(const engine_t* e, const double* v, int32_t c) noexcept nogil:
@@ -63,8 +135,8 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         if -e.gap[c] > depth:
             depth = -e.gap[c]
     for i in range(e.size[N_JOINT]):
-        for j in range(e.ptr[i], e.ptr[i + 1]):
-            if is_rigid_joint_row(e, i, j) and fabs(e.joint_error[j]) > joint_error:
+        for j in range(e.ptr[i], e.ptr[i] + count_projected_rows(e, i)):
+            if fabs(e.joint_error[j]) > joint_error:
                 joint_error = fabs(e.joint_error[j])
     e.setting[S_DEPTH] = depth
     e.setting[S_JOINT_ERROR] = joint_error
@@ -74,16 +146,12 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = e.v_free[i] + e.dv[i]              # temporarily v+
     for i in range(e.size[N_JOINT]):
-        a = e.joint_body[2 * i]
-        b = e.joint_body[2 * i + 1]
-        for j in range(e.ptr[i], e.ptr[i + 1]):
-            e.push[j] = 0.0
-            x = e.joint_error[j] + h * joint_row_velocity(e.jac + 12 * j, e.shift, a, b)
-            goal[j] = -clip(beta * x, -max_correction, max_correction)
-            if fabs(goal[j]) > before and is_rigid_joint_row(e, i, j):
-                before = fabs(goal[j])
-            if fabs(x) > 1e-3 * slop and is_rigid_joint_row(e, i, j):
-                due = 1
+        x = set_joint_goal(e, i, e.shift, goal)
+        if x > 1e-3 * slop:
+            due = 1
+        x = beta * x if beta * x < max_correction else max_correction
+        if x > before:
+            before = x
     for c in range(n):
         e.push[mj + c] = 0.0
         x = -beta * (e.gap[c] + h * contact_normal_velocity(e, e.shift, c) + slop)
@@ -101,12 +169,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
         max_sweeps = MAX_SWEEPS
     for sweep in range(1, max_sweeps + 1):
         for i in range(e.size[N_JOINT]):
-            a = e.joint_body[2 * i]
-            b = e.joint_body[2 * i + 1]
-            for j in range(e.ptr[i], e.ptr[i + 1]):
-                if is_rigid_joint_row(e, i, j):
-                    change = (goal[j] - joint_row_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
-                    apply_joint_impulse(e.minv_jac + 12 * j, change, e.shift, a, b)
+            project_joint(e, i, goal)                   # (2)
         for c in range(n):
             new_multiplier = project_normal_update(e.push[mj + c], contact_normal_velocity(e, e.shift, c) - goal[mj + c],
                                           e.step[e.ptr[e.size[N_JOINT] + c]])                           # (1)

@@ -31,7 +31,7 @@ from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_
 from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport build_contacts, store_contact_cache
-from lavender_ext.engine.joints cimport build_joint_rows
+from lavender_ext.engine.joints cimport build_joint_rows, store_joint_impulses
 from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
 from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport score_given_slack
@@ -185,15 +185,14 @@ cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
 
 cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     """Write the statistics, store the contact cache, project and advance the bodies; return OK or NOT_FINITE."""
-    cdef int32_t i, shifted, nonfinite_body
+    cdef int32_t shifted, nonfinite_body
     cdef double* out = e.setting + S_OUT
     # statistics
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
     out[2] = e.head[H_CONTACTS]
     out[3] = e.head[H_MATCHES]
-    for i in range(e.size[N_JOINT_ROW]):
-        e.joint_impulse[i] = e.impulse[i]
+    store_joint_impulses(e)
     # cache, projection, integration
     nonfinite_body = find_nonfinite_body(e)
     store_contact_cache(e)
