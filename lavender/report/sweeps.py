@@ -67,7 +67,8 @@ class SweepStudy:
     def _are_equal(self, one: str, two: str) -> bool:
         """Return whether two solvers have equal errors for each number of sweeps."""
         a, b = (self.errors.loc[name].clip(lower=1e-12) for name in (one, two))
-        is_near = np.abs(np.log(a / b)).fillna(0.0) < np.log(EQUAL_RATIO)
+        with np.errstate(divide="ignore"):  # A solver may have diverged: its error is infinite.
+            is_near = np.abs(np.log(a / b)).fillna(0.0) < np.log(EQUAL_RATIO)
         return bool((a.isna() == b.isna()).all() and is_near.all())
 
     def _find_smallest(self, solver: str, errors: pd.DataFrame | None = None) -> int | None:
