@@ -490,6 +490,8 @@ def residual(
     >>> early.verdict, early.excess > 1e4
     ('stopped before convergence', True)
     """
+    if type(impulse) is np.ndarray:  # The caller may change it before `islands` is read.
+        impulse = impulse.copy()
     result = measure_residual(problem, impulse, precision, threshold, tol)
     motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
     if (
