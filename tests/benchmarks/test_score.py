@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from benchmarks.score import scenes
 from benchmarks.score.records import read_records
-from benchmarks.score.run import command, run_cells
+from benchmarks.score.run import command, measure_cell, run_cells
 from benchmarks.score.settings import ENGINES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -249,3 +249,32 @@ def test_score_page_has_the_numbers_of_the_table():
     repeated = [row for row in read_records().values() if row.runs >= 3 and not row.note]
     assert len(repeated) > 200 and all(row.spread == 0.0 for row in repeated)
     assert "Repeated cells have equal errors" in text
+
+
+class Stub:
+    """A simulator of known cost: each run takes two million steps of 3 µs, the engine's start 5 s."""
+
+    def __init__(self):
+        self.cpu, self.steps, self.residual, self.residuals = 5.0, 7, 1e-9, True
+
+    def start_cell(self):
+        self.cpu = self.steps = 0
+
+    def run(self, scene, dt, every):
+        self.steps += 2_000_000
+        self.cpu += 6.0
+        return follow(still, still)(scene, dt, every)
+
+
+def test_score_cost_is_the_time_of_one_step_in_microseconds():
+    errors, costs, *_ = measure_cell(Stub(), "stick", 240, 3)
+    assert costs == pytest.approx([3.0] * 3) and len(errors) == 3
+
+
+@pytest.mark.parametrize("scene", scenes.SCENES)
+def test_score_class_of_an_error_counts_the_limits_that_it_exceeds(scene):
+    limits = scenes.SCENES[scene].limits
+    for i, limit in enumerate(limits):
+        assert scenes.classify(scene, limit) == i and scenes.classify(scene, 1.001 * limit) == i + 1
+    assert scenes.classify(scene, 0.0) == 0
+    assert scenes.classify(scene, math.nan) == scenes.classify(scene, math.inf) == len(limits)

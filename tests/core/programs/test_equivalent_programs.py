@@ -247,3 +247,15 @@ def test_named_rows_of_a_program_without_solution_are_the_reason(solver, kind):
         assert alone.solution.status is lv.Status.INFEASIBLE, (named, str(alone))
         others = lv.solve_qp(**keep_rows(p, named, False), solver=solver)
         assert others.found, (named, str(others))
+
+
+@pytest.mark.parametrize("solver", installed("clarabel", "daqp", "piqp", "quadprog"))
+@pytest.mark.parametrize("size", [1e2, 1e8])
+def test_equations_far_from_zero_take_one_call(solver, size):
+    """Rows that hold by far at x = 0 may be left out at first, but no equation of either sign."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        a, b = rng.normal(size=(2, 6)), np.array([size, -size])
+        answer = lv.solve_qp(np.eye(6), np.zeros(6), A=a, b=b, solver=solver, tol=1e-6)
+        np.testing.assert_allclose(answer.x, a.T @ np.linalg.solve(a @ a.T, b), rtol=1e-5)
+        assert answer.solution.work["backend_calls"] == 1
