@@ -25,6 +25,8 @@ MAX_DENSE_FILL = 4
 # A backend that replaces the handler of Ctrl-C puts the previous one back. Two of them at the same time would leave the
 # handler of one, with which Ctrl-C no longer raises KeyboardInterrupt.
 _HANDLER_LOCK = threading.Lock()
+# Words in the status of a backend that did not run, because it refused its settings or the program.
+REFUSALS = "invalid", "not_run", "unsolved"
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,10 @@ def _call_through_qpsolvers(
     # Collect the status, the iterate and the multipliers.
     extras = solution.extras or {}
     status, text = _get_status(solution, extras)
+    if any(
+        word in text.lower() for word in REFUSALS
+    ):  # The point and the counts were never written.
+        return Answer(Status.NUMERICAL_ERROR, text)
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
     lam = program.join_multipliers(solution.y, solution.z, solution.z_box, backend.finite)
     count = _find_value(

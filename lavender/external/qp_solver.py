@@ -39,6 +39,8 @@ MAX_STEP_SIZE = 20_000  # No Newton step is done with more variables and active 
 LONG_STEP_TIME, MAX_SHORT_STEP_SIZE = 0.05, 300
 # With more variables and rows, the Newton step is done only if the error exceeds tol.
 MAX_FREE_STEP_SIZE = 500
+# Components of a program that misses tol are solved alone unless there are more of them.
+MAX_SINGLE_COMPONENTS = 50
 OPTION_HELP = {
     "isolate": "run the backend in another process, which is killed at the time limit: True always, False never, None "
     "(default) under a limit if the backend has none of its own",
@@ -270,7 +272,7 @@ class QPSolver(Solver):
         """Solve the components of a program that miss tol alone, with their own sizes, and add their work."""
         if not judge.error > tol or judge.x is None or judge.lam is None:
             return
-        if program.components[1] == 1:
+        if not 1 < program.components[1] <= MAX_SINGLE_COMPONENTS:
             return
         x, lam = judge.x.copy(), judge.lam.copy()
         for rows, columns in program.list_components():

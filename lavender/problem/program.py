@@ -27,6 +27,7 @@ whose matrix is not symmetric. Solvers of quadratic programs receive P, q, J and
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -69,6 +70,10 @@ MAX_SINGULAR_PIVOT = 1e-13
 # eigenvalues that rounding causes.
 SEMIDEFINITE_SHIFT = 1e-12
 INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
+# A row without coefficients holds if x = 0 violates it by at most this multiple of the largest right-hand side of the
+# rows with coefficients: 16 unit roundoffs, as for the terms of a row.
+EMPTY_ROW_ROUNDING = 2.0**-49
+IMPOSSIBLE_SIDE = 1.0  # Right-hand side of a row G x <= -inf, which becomes 0 >= 1.
 MAX_NAMED_ROWS = 8  # A message names up to this many rows.
 MAX_PROGRAM_ASYMMETRY = (
     1e-8  # [-] An asymmetry of P up to this multiple of its largest entry is removed.
@@ -86,7 +91,7 @@ class QPSolution:
 
     Parameters
     ----------
-    x : (n,)
+    x : (n,), or None if it is proven that no x satisfies the constraints
     y : (me,), or None without A
         Multipliers of A x = b.
     z : (mi,), or None without G
@@ -102,7 +107,7 @@ class QPSolution:
         Largest error of a solution that counts as found.
     """
 
-    x: FloatArray
+    x: Any
     y: FloatArray | None
     z: FloatArray | None
     z_box: FloatArray | None
@@ -116,6 +121,8 @@ class QPSolution:
     def __str__(self) -> str:
         if self.ray is not None:
             return f"unbounded: the objective decreases without end along ray; at x it is {self.objective:.6g}"
+        if self.x is None:
+            return f"infeasible: no x satisfies the constraints ({self.solution.message})"
         # Show the status only if the program is not solved.
         status = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
         if status == "CONVERGED, ":
@@ -130,11 +137,15 @@ class QPSolution:
     @cached_property
     def _judged(self) -> tuple[Any, ...]:
         """Result of `judge_program` for x and the multipliers."""
+        if self.x is None:
+            return (np.inf,)
         return self.qp.judge(self.x, self.qp.select_row_multipliers(self.impulse))
 
     @property
     def objective(self) -> float:
-        """Objective 1/2 x.P x + q.x."""
+        """Objective 1/2 x.P x + q.x; NaN without x."""
+        if self.x is None:
+            return np.nan
         curvature = self.qp.generalized.momentum_of(self.x)
         return float(0.5 * self.x @ curvature + self.qp.q @ self.x)
 
@@ -149,14 +160,18 @@ class QPSolution:
 
     @property
     def primal_residual(self) -> float:
-        """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
+        """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub; inf without x."""
+        if self.x is None:
+            return np.inf
         qp = self.qp
         slack = qp.generalized.jac @ self.x - qp.target
         return float(np.append(np.abs(slack[: qp.free]), -slack[qp.free :]).max(initial=0.0))
 
     @property
     def dual_residual(self) -> float:
-        """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z."""
+        """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z; inf without x."""
+        if self.x is None:
+            return np.inf
         qp = self.qp
         lam = self.qp.select_row_multipliers(self.impulse)
         residual = qp.generalized.momentum_of(self.x) + qp.q - qp.generalized.jac.T @ lam
@@ -164,7 +179,9 @@ class QPSolution:
 
     @property
     def duality_gap(self) -> float:
-        """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|."""
+        """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|; inf without x."""
+        if self.x is None:
+            return np.inf
         qp = self.qp
         lam = self.qp.select_row_multipliers(self.impulse)
         return float(abs(self.x @ (qp.generalized.momentum_of(self.x) + qp.q) - qp.target @ lam))
@@ -333,10 +350,57 @@ class QuadraticProgram:
         general = self.generalized
         if q is not None and not self.is_singular:
             general = general.with_jacobian(None, general.solve(-changes["q"]))
-        new = replace(self, target=mark_read_only(target), generalized=general, **changes)
+        new = replace(self, target=target, generalized=general, **changes)
         for name in ("hessian", "jacobian"):
             new.__dict__[name] = getattr(self, name)
+        new.clear_rounding_of_empty_rows()
         return new
+
+    @cached_property
+    def violated_empty_rows(self) -> IntpArray:
+        """Rows of A and G without coefficients that no x satisfies, (k,) int."""
+        return np.flatnonzero(self._is_empty_row & self._violates_zero)
+
+    @property
+    def _is_empty_row(self) -> npt.NDArray[np.bool_]:
+        """Whether each row has no coefficients (m,)."""
+        ptr, _, value = self.jacobian
+        is_empty = np.ones(len(self.target), bool)
+        is_empty[np.repeat(np.arange(len(self.target)), np.diff(ptr))[value != 0.0]] = False
+        return is_empty
+
+    @property
+    def _violates_zero(self) -> npt.NDArray[np.bool_]:
+        """Whether x = 0 violates each row (m,)."""
+        violates: npt.NDArray[np.bool_] = self.target > 0.0
+        violates[: self.free] |= self.target[: self.free] < 0.0
+        return violates
+
+    def clear_rounding_of_empty_rows(self) -> None:
+        """Set right-hand sides of a new program's rows without coefficients to 0 if they are rounding of the others.
+
+        They are if x = 0 violates them by at most EMPTY_ROW_ROUNDING of the largest right-hand side of the rows of A
+        and G with coefficients. A warning names the rows. `target` becomes read-only.
+        """
+        ptr, _, value = self.jacobian
+        target = self.target
+        if not (np.diff(ptr).all() and value.all()):
+            is_general = self.variable < 0
+            is_empty = self._is_empty_row
+            largest = np.abs(target).max(initial=0.0, where=is_general & ~is_empty)
+            is_rounding = is_empty & is_general & self._violates_zero
+            is_rounding &= np.abs(target) <= EMPTY_ROW_ROUNDING * largest
+            if self.has_impossible_rows:
+                is_rounding &= target != IMPOSSIBLE_SIDE
+            if is_rounding.any():
+                names = self.describe_rows(is_rounding.astype(float))
+                warnings.warn(
+                    f"rows without coefficients hold up to rounding, with right-hand sides of up to "
+                    f"{np.abs(target[is_rounding]).max():.1e} beside {largest:.1e}: {names}",
+                    stacklevel=4,
+                )
+                target[is_rounding] = 0.0
+        mark_read_only(target)
 
     def recover_variables(self, impulse: FloatArray) -> FloatArray:
         """Compute x (n,) from the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""
@@ -447,9 +511,9 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         )
     general, is_singular = _factor_hessian(lower, jac, q)
     n_a, n_g = (None if side is None else len(side) for side in (b, h))
-    return QuadraticProgram(
+    program = QuadraticProgram(
         q=q,
-        target=mark_read_only(target),
+        target=target,
         free=n_fixed + (n_a or 0),
         generalized=general,
         is_singular=is_singular,
@@ -460,6 +524,8 @@ def make_quadratic_program(arrays: ProgramArrays) -> QuadraticProgram:
         kept=None if h is None or n_kept == n_g else np.flatnonzero(h < INFINITE),
         has_impossible_rows=h is not None and bool(np.isneginf(h).any()),
     )
+    program.clear_rounding_of_empty_rows()
+    return program
 
 
 # -- conversion of arguments --------------------------------------------------------------------------

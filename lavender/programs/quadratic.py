@@ -116,7 +116,7 @@ def solve_qp(
     -------
     QPSolution
         x, y, z, z_box with their `error`. `found` is True exactly if `solution.status` is CONVERGED, exactly if the
-        error is at most `tol`. INFEASIBLE: no x satisfies the constraints, and
+        error is at most `tol`. INFEASIBLE: no x satisfies the constraints, x is None, and
         `answer.qp.multipliers(answer.solution.certificate)` proves it. UNBOUNDED: the objective decreases without
         limit along `ray`, and x satisfies the constraints.
 
@@ -210,15 +210,17 @@ class _Task:
 
     def solve(self, begun: float) -> QPSolution:
         """Run the solvers, search for proofs, and build the answer."""
-        if not len(self.qp.q):  # Judge the only point, or prove that a row contradicts itself.
-            target, free = self.qp.target, self.qp.free
-            self.start = np.zeros(len(target))
+        rows = self.qp.violated_empty_rows
+        if not len(self.qp.q) or len(rows):  # A row contradicts itself, or x has no entries.
+            self.start = np.zeros(len(self.qp.target) + len(self.qp.q) * self.qp.is_singular)
             self._judge_start()
-            if not self.judge.error <= self.tol:
-                violation = np.append(np.abs(target[:free]), target[free:])
-                y = np.where(np.arange(len(target)) == np.argmax(violation), np.sign(target), 0.0)
+            if len(rows):
+                row = rows[np.argmax(np.abs(self.qp.target[rows]))]
+                y = np.zeros(self.problem.m)
+                y[self.problem.m - len(self.qp.target) + row] = np.sign(self.qp.target[row])
                 proof = prove_infeasibility(self.problem, y)
-                self.proof = None if proof.reason else proof
+                # J^T y = 0 and t.y > 0 hold exactly, however small t is beside other rows.
+                self.proof = Proof(y, math.inf) if proof.reason else proof
             return self._make_answer(begun)
         for step in self._list_steps():
             step()
@@ -383,7 +385,7 @@ class _Task:
         if conflict:
             solution = solution.with_fields(claim_check=CONTRADICTED)
         return QPSolution(
-            x=mark_read_only(x),
+            x=mark_read_only(x) if self.proof is None else None,
             y=y,
             z=z,
             z_box=box,

@@ -489,7 +489,9 @@ def test_program_without_variables_is_found_unless_a_row_contradicts_itself(solv
     rows |= {"A": np.zeros((len(b), 0)), "b": np.array(b)} if b else {}
     answer = lv.solve_qp(P=np.zeros((0, 0)), q=np.zeros(0), solver=solver, **rows)
     is_solvable = min(h, default=0.0) >= 0.0 and not np.any(b)
-    assert answer.x.shape == (0,) and answer.found == is_solvable
+    assert answer.found == is_solvable and (
+        answer.x.shape == (0,) if is_solvable else answer.x is None
+    )
     assert answer.solution.status is (lv.Status.CONVERGED if is_solvable else lv.Status.INFEASIBLE)
 
 
@@ -553,3 +555,58 @@ def test_solve_qp_error_adds_gaps_of_opposite_signs():
     exact = lv.solve_qp(problem, tol=1e-12).impulse
     off = problem.qp.solution(exact + np.array([1e-3, -1e-3, 0.0, 0.0]), 1e-6)
     assert off.duality_gap <= 1e-9 and off.error >= 0.9e-3
+
+
+@pytest.mark.parametrize(
+    "solver", ["auto", "newton", "osqp", *installed("piqp", "clarabel", "daqp")]
+)
+@pytest.mark.parametrize("side", [7e-18, 1e-15])
+def test_row_of_zeros_with_a_side_of_rounding_holds_with_a_warning(solver, side):
+    with pytest.warns(UserWarning, match=r"without coefficients.*G\[0\]"):
+        problem = lv.Problem.from_qp(
+            np.eye(2), [-1.0, -2.0], G=[[0.0, 0.0], [1.0, 1.0]], h=[-side, 100.0]
+        )
+    answer = lv.solve_qp(problem, solver, tol=1e-6)
+    assert answer.found
+    np.testing.assert_allclose(answer.x, [1.0, 2.0], rtol=1e-5)
+    with pytest.warns(UserWarning, match="without coefficients"):
+        assert lv.solve_qp(problem, solver, h=[-side, 101.0], tol=1e-6).found
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", "osqp"])
+@pytest.mark.parametrize("h", [[-1e-12, 100.0], [-1e-15, 1e-9], [-np.inf, 1e17]])
+def test_row_of_zeros_that_no_x_satisfies_is_named(solver, h):
+    # A bound is no right-hand side of G or A.
+    arrays = {"P": np.eye(2), "q": [-1.0, -2.0], "G": [[0.0, 0.0], [1.0, 1.0]], "ub": [1e16, 1e16]}
+    answer = lv.solve_qp(**arrays, h=h, solver=solver, tol=1e-6)
+    assert answer.solution.status is lv.Status.INFEASIBLE and not answer.found
+    assert answer.x is None and answer.error == np.inf and np.isnan(answer.objective)
+    assert answer.solution.message.endswith("contradicting rows: G[0]") and "infeasible" in str(
+        answer
+    )
+
+
+@pytest.mark.parametrize(
+    "solver", installed("piqp", "osqp", "clarabel", "daqp", "highs", "scs", "qpalm", "quadprog")
+)
+def test_backend_that_does_not_run_has_no_point(solver):
+    for n in (2, 3, 40):
+        q = -np.arange(1.0, n + 1.0)
+        answer = lv.solve_qp(np.eye(n), q, lb=-np.ones(n), ub=np.ones(n), solver=solver, max_iter=0)
+        assert (
+            answer.solution.status is lv.Status.MAX_ITERATIONS and answer.solution.iterations == 0
+        )
+        assert not answer.found and not answer.x.any()
+
+
+@pytest.mark.parametrize("solver", installed("piqp", "osqp", "scs", "qpalm"))
+def test_backend_that_refuses_its_settings_has_no_point(solver):
+    for n in (2, 3, 40):
+        q = -np.arange(1.0, n + 1.0)
+        answer = lv.solve_qp(
+            np.eye(n), q, lb=-np.ones(n), ub=np.ones(n), solver=solver, settings={"eps_abs": -1.0}
+        )
+        assert (
+            answer.solution.status is lv.Status.NUMERICAL_ERROR and answer.solution.iterations == 0
+        )
+        assert not answer.found and not answer.x.any()
