@@ -3,7 +3,7 @@
 #define LAVENDER_LANES_H
 #include <math.h>
 typedef struct {
-    int m, n, law, k;
+    int m, n, law, k, warm;                 /* warm: `solve` begins at lam, else at the zero impulse */
     const int *ptr, *kind;                  /* blocks of every lane: first rows (k + 1), 0 for bounded rows (k) */
     double asymmetry;                       /* permitted asymmetry of M, as in `worlds_t`; below 0: M is a lower triangle */
     double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper;         /* data */

@@ -26,7 +26,7 @@ from lavender_ext.small.task cimport COUNT_ITERATIONS, COUNT_STEPS_OF_LANE, COUN
 
 cdef extern from "lanes.h":
     ctypedef struct lanes_t "lavender_lanes_t":
-        int32_t m, n, law, k
+        int32_t m, n, law, k, warm
         const int32_t *ptr, *kind
         double asymmetry
         double *jac, *mass, *free, *target, *soft, *mu, *lower, *upper
@@ -282,8 +282,8 @@ cdef inline bint is_solved_in_one_lane(const blocks_t* p, const generalized_t* g
 
 
 cdef inline bint solve_in_one_lane(const blocks_t* p, const generalized_t* g, const double* zero_residual, double tol,
-                                   workspace_t* workspace, double* lam, int32_t* counts) noexcept nogil:
-    """Solve from the zero impulse, with the bits of a lane, into lam (m); return False without memory.
+                                   bint warm, workspace_t* workspace, double* lam, int32_t* counts) noexcept nogil:
+    """Solve with the bits of a lane, from and into lam (m), or from the zero impulse unless `warm`; return False without memory.
 
     The work is added to counts (`add_lane_counts`).
     """
@@ -293,7 +293,7 @@ cdef inline bint solve_in_one_lane(const blocks_t* p, const generalized_t* g, co
     cdef int32_t ptr[MAX_LANE_ROWS + 1]
     cdef int32_t kind[MAX_LANE_ROWS]
     cdef const double* y
-    x.m, x.n, x.law, x.tol, x.k = p.n_rows, g.n, p.law, tol, p.n_blocks
+    x.m, x.n, x.law, x.tol, x.k, x.warm = p.n_rows, g.n, p.law, tol, p.n_blocks, warm
     if not grow_workspace_to(workspace, 0, bind_lanes(&x, 1, NULL)):
         return False
     bind_lanes(&x, 1, workspace.real)

@@ -285,10 +285,46 @@ ISA static void LANE(bound)(const lavender_lanes_t* x, V* lam, int to_cones) {
     }
 }
 
-/* Solve from the zero impulse to `tol`: block sweeps, then Newton steps. Sweeps replace a step that gains nothing; a lane
- * with MISSES such steps ends. A singular A is not solved: more rows than velocities need compliance. */
+/* Choose where lanes with a start begin, from Y^T in `across`: lam projected on its bounds, or the zero impulse if that has
+ * the lower objective f = 1/2 lam.(w - b) (judge/best.pxd). Return the lanes that are not solved there; `now` receives the
+ * square of the relative residual, 1 at the zero impulse. */
+ISA static I LANE(start)(const lavender_lanes_t* x, const V* across, V* now) {
+    const int m = x->m, n = x->n, ld = LAVENDER_PLACES(V, m);
+    const V *y = (const V*)x->y, *soft = (const V*)x->soft, *b = (const V*)x->b, *out = (const V*)x->out;
+    const V zero = {0.0}, one = zero + 1.0;
+    V *lam = (V*)x->lam, *w = (V*)x->w, *push = (V*)x->push, energy, fast, worst, objective = zero;
+    LANE(bound)(x, lam, 1);
+    for (int k = 0; k < n; k++) push[k] = zero;
+    for (int r = 0; r < m; r++) {
+        const V impulse = lam[r], *row = y + r * n;
+        if (!LANE(any)((I)(impulse != 0.0))) continue;
+        LAVENDER_APART
+        for (int k = 0; k < n; k++) push[k] += row[k] * impulse;
+    }
+    for (int r = 0; r < m; r++) w[r] = soft[r] * lam[r] - b[r];
+    for (int r = m; r < ld; r++) w[r] = zero;
+    for (int k = 0; k < n; k++) {
+        const V *column = across + k * ld, z = push[k];
+        LAVENDER_APART
+        for (int r = 0; r < ld; r++) w[r] += column[r] * z;
+    }
+    LANE(errors)(x, lam, w, (V*)x->e, &energy, &fast, &worst);
+    for (int r = 0; r < m; r++) objective += lam[r] * (w[r] - b[r]);
+    energy /= out[LANE_START_ENERGY] * out[LANE_START_ENERGY];
+    fast /= out[LANE_START_SPEED] * out[LANE_START_SPEED];
+    *now = LANE(larger)(energy, fast);
+    const I solved = (I)(*now <= x->tol * x->tol), better = solved | (I)(objective < 0.0);
+    for (int r = 0; r < m; r++) lam[r] = LANE(pick)(better, lam[r], zero);
+    *now = LANE(pick)(better, *now, one);
+    return ~solved;
+}
+
+/* Solve to `tol` from lam if `warm`, else from the zero impulse: block sweeps, then Newton steps. A start that is a solution
+ * is only projected on its bounds. Sweeps replace a step that gains nothing; a lane with MISSES such steps ends. A singular
+ * A is not solved: more rows than velocities need compliance. */
 ISA static void LANE(solve)(const lavender_lanes_t* x) {
-    enum { FIRST_SWEEPS = 6, MORE_SWEEPS = 12, ROUNDS = 10, MISSES = 3 };
+    enum { FIRST_SWEEPS = 6, NEAR_SWEEPS = 1, MORE_SWEEPS = 12, ROUNDS = 10, MISSES = 3 };
+    const double NEAR = 0.5;                /* relative residual below which a start needs fewer sweeps */
     const int m = x->m, n = x->n, ld = LAVENDER_PLACES(V, m);
     const V *y = (const V*)x->y, *soft = (const V*)x->soft, *d = (const V*)x->d, zero = {0.0}, one = zero + 1.0;
     V *a = (V*)x->a, *lam = (V*)x->lam, *step = (V*)x->step, *change = (V*)x->change, *kept = (V*)x->kept;
@@ -298,13 +334,15 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
     I on = (I)(out[LANE_IS_PLAIN] > 0.0);
     out[LANE_SWEEPS] = out[LANE_STEPS] = zero;
     for (int r = 0; r < m; r++) {
-        lam[r] = zero;
+        if (!x->warm) lam[r] = zero;
         on &= (I)(out[LANE_COUNT] <= (double)n) | (I)(soft[r] >= 1e-5 * d[r]);
         for (int k = 0; k < n; k++) across[k * ld + r] = y[r * n + k];
     }
     for (int k = 0; k < n; k++)
         for (int r = m; r < ld; r++) across[k * ld + r] = zero;
+    if (x->warm) on &= LANE(start)(x, across, &now);
     if (!LANE(any)(on)) return;
+    const I ran = on;
     for (int i = 0; i < x->k; i++) {
         int count = 0;
         LAVENDER_UP(k, x->own + i * LANE_LIST) own[count++] = k;
@@ -345,8 +383,15 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
         step[r] = 1.0 / top;
         step[r + 1] = step[r + 2] = 1.0 / low;
     }
-    LANE(sweep)(x, FIRST_SWEEPS, on);
-    sweeps = LANE(pick)(on, zero + (double)FIRST_SWEEPS, zero);
+    if (x->warm) {
+        const I far = on & (I)(now > NEAR * NEAR);
+        sweeps = LANE(pick)(far, zero + (double)FIRST_SWEEPS, LANE(pick)(on, zero + (double)NEAR_SWEEPS, zero));
+        if (LANE(any)(far)) LANE(sweep)(x, FIRST_SWEEPS - NEAR_SWEEPS, far);
+        LANE(sweep)(x, NEAR_SWEEPS, on);
+    } else {
+        LANE(sweep)(x, FIRST_SWEEPS, on);
+        sweeps = LANE(pick)(on, zero + (double)FIRST_SWEEPS, zero);
+    }
     now = LANE(measure)(x);
     on &= (I)(now > 0.25 * x->tol * x->tol);
     for (int round = 0; round < ROUNDS && LANE(any)(on); round++) {
@@ -374,7 +419,7 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
         on &= (I)(now > 0.25 * x->tol * x->tol);
     }
     LANE(bound)(x, lam, 1);
-    for (int r = 0; r < m; r++) lam[r] += 0.0;
+    for (int r = 0; r < m; r++) lam[r] = LANE(pick)(ran, lam[r] + 0.0, lam[r]);
     out[LANE_SWEEPS] = sweeps;
     out[LANE_STEPS] = steps;
 }

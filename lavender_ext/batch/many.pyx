@@ -615,7 +615,7 @@ cdef class Worlds:
         bind_lanes(&x, width, <double*>((<size_t>h.at[LANES].real + 63) & ~<size_t>63))
         load_lanes(&x, &rows, &self.w, self.lam, worlds, n_worlds, width)
         prepare_lanes(&x, width)
-        x.tol = tol
+        x.tol, x.warm = tol, not self.cold
         if not judges:
             solve_lanes(&x, width)
         judge_lanes(&x, width)
@@ -758,7 +758,7 @@ cdef class Worker:
             own = until[0]
             until = &own
         if not judges:
-            uses_lanes = limits != NULL and limits.lanes != 0.0 and w.cold
+            uses_lanes = limits != NULL and limits.lanes != 0.0
         if uses_lanes and w.width > 1 and until == NULL:        # With a limit of time, worlds are solved in their own order.
             if w.order is None:                         # Only lanes need the order.
                 w.order_worlds()

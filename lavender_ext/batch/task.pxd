@@ -6,6 +6,7 @@ violates its target, or if the estimated cost is above the limit.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, fabs
+from libc.string cimport memcpy
 
 from lavender_ext.core.arena cimport arena_t, has_memory, make_arena, take_doubles, take_integers
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
@@ -26,7 +27,8 @@ from lavender_ext.small.call cimport (are_all_rows_bounded, can_use_small_call, 
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
 from lavender_ext.small.task cimport (BOUND, COUNT_EVALUATIONS, COUNT_FACTORISATIONS, COUNT_ITERATIONS,
-                                      COUNT_ROUNDS, FORMED, ISLANDS, NUMBERS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, WORK,
+                                      COUNT_ROUNDS, FORMED, ISLANDS, LANE_START, NUMBERS, RESULT_FAILED,
+                                      RESULT_IS_START, RESULT_SOLVED, WORK,
                                       count_task_scratch, grow_workspace_to_arena, small_rules_t, task_t)
 from lavender_ext.batch.lanes cimport is_solved_in_one_lane, solve_in_one_lane
 from lavender_ext.batch.world cimport THIN_PADDING, LEFT, READY, STARTED, TRIED, compress_dense_rows
@@ -147,13 +149,18 @@ cdef inline int32_t solve_generalized_task(task_t* j, workspace_t* workspaces, c
     cdef newton_cost_t cost
     cdef bint soft, is_late
     cdef int32_t code
-    if limits.lanes != 0.0 and j.cold and not j.failed_in_lanes and j.made.n_empty == 0 \
-            and is_solved_in_one_lane(p, &j.g, j.zero_residual):
-        if solve_in_one_lane(p, &j.g, j.zero_residual, j.tol, workspace, j.lam, j.counts) \
+    cdef double* start
+    if limits.lanes != 0.0 and not j.failed_in_lanes and j.made.n_empty == 0 \
+            and is_solved_in_one_lane(p, &j.g, j.zero_residual) \
+            and grow_workspace_to(&workspaces[LANE_START], 0, p.n_rows):
+        start = workspaces[LANE_START].real
+        memcpy(start, j.lam, p.n_rows * sizeof(double))
+        if solve_in_one_lane(p, &j.g, j.zero_residual, j.tol, not j.cold, workspace, j.lam, j.counts) \
                 and grow_workspace_to(workspace, 0, count_task_scratch(j)):
             judge_task(j, workspace.real)
             if j.solved:
                 return RESULT_SOLVED
+        memcpy(j.lam, start, p.n_rows * sizeof(double))
     # cost limits, workspace
     soft = needs_no_proximal_terms(p, &j.g)
     cost = estimate_newton_cost_terms(p, &j.g, limits)

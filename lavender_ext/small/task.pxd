@@ -35,6 +35,7 @@ cdef enum:                      # workspaces of one thread
     NUMBERS = 3                 # A, d, nu and step
     FORMED = 4                  # A of bodies
     BOUND = 5                   # workspace of `derive_small_problem`
+    LANE_START = 5              # of J and M: start of a lane, for the method that follows if the lane fails
     N_CALL_WORKSPACES = 6
 
 
