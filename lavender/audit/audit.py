@@ -30,6 +30,7 @@ from lavender.audit.engine_scenes import CLAIM_ENGINES, step_scene
 from lavender.audit.environment import is_environment, iterate_environment, make_environment_runs
 from lavender.audit.pieces import NOT_JUDGED, Judging, Piece, Prediction, judge_steps
 from lavender.audit.result import Audit
+from lavender.audit.rigid_laws import explain_steps
 from lavender.audit.simulated_worlds import (
     ENGINES,
     SPREADS,
@@ -313,6 +314,8 @@ def _audit_model(
     last = {d.world: d.step - DIVERGENCE_MARGIN for d in result.divergences}
     states = sorted(result.contact_states, key=lambda entry: entry[:2])
     result.contact_states[:] = [s for s in states if s.step < last.get(s.world, np.inf)]
+    if not result.is_stopped:
+        result.causes = explain_steps(runs, [(w.world, w.step) for w in result.worst])
     return result
 
 

@@ -30,6 +30,12 @@ from lavender.report.text import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+#: Largest part of the error of the worst step -> its cause, if the cause is not the solver.
+OWN_CAUSES = {
+    "lost digits": "Cause: the integrator. It moves the bodies by the forces, which have lost their digits, and the "
+    'acceleration is exact: <option integrator="discrete"/> uses the acceleration.',
+    "noslip": "Cause: noslip_iterations, a pass after the solver, which does not solve the engine's problem.",
+}
 ENGINE_ADVICE = "To find out whether the engine is the cause, audit again with --engine mujoco."
 OUTSIDE_SOLVER = (
     "outside the constraint solver (time step, integrator, actuators or the model itself)"
@@ -241,7 +247,10 @@ class AuditCounts:
     @property
     def sentences(self) -> list[str]:
         """When and where, then the cause."""
-        texts = self._describe_place(), self._describe_cause(), self.audit.compare_in_words()
+        causes = self.audit.causes
+        laws = max(causes, key=lambda x: abs(x.difference)).sentence if causes else ""
+        against = self.audit.compare_in_words()
+        texts = self._describe_place(), self._describe_cause(), laws, against
         return [*filter(None, texts)]
 
     def _describe_place(self) -> str:
@@ -288,11 +297,15 @@ class AuditCounts:
             if exact < audit.n_diverged:
                 texts.append(DIVERGENCE_ADVICE if audit.engine == "mujoco" else ENGINE_ADVICE)
         elif self.above:
+            own = audit.causes[0].own[0] if audit.causes and audit.worst else ""
             n = int((self.is_above & stopped).sum())
-            if n:
+            if own in OWN_CAUSES:
+                texts.append(OWN_CAUSES[own])
+            elif n:
                 these = "All these" if n == self.above else f"{format_number(n)} of these"
                 texts.append(f"Cause: the solver. {these} solves stopped before convergence.")
-            if n_wrong := int((self.is_above & wrong).sum()):
+            n_wrong = 0 if own in OWN_CAUSES else int((self.is_above & wrong).sum())
+            if n_wrong:
                 count = f"{format_count(n_wrong, 'answer')} of the engine {'is' if n_wrong == 1 else 'are'}"
                 texts.append(f"{count} no solution of its own problem.")
         elif n := int((stopped | wrong).sum()):

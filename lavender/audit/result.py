@@ -24,6 +24,7 @@ from lavender.audit.pieces import (
     Worst,
 )
 from lavender.audit.provenance import describe_provenance, format_provenance
+from lavender.audit.rigid_laws import StepCauses
 from lavender.audit.simulated_worlds import Divergence, Runs, can_any_geoms_collide
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.lazy_import import pandas as pd
@@ -89,6 +90,8 @@ class Audit:
     n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
     lost_digits: list[tuple[float, float]] = field(default_factory=list)  # See `Piece`.
     prediction: Prediction = field(default_factory=Prediction)
+    # Causes of the worst steps, then of the step with the largest difference from the rigid laws; of MuJoCo only.
+    causes: list[StepCauses] = field(default_factory=list)
     against: Audit | None = None  # Result of another model on the same states.
     provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
     folder: Path = Path("lavender-audit")  # To which `write` wrote.
