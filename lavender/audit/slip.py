@@ -1,53 +1,54 @@
-"""Explain why contacts slip: solve an engine's step again in variants, each of which replaces one more property.
+"""Explain why contacts slip: the difference of an engine's step from the rigid laws, read along contact surfaces.
 
     explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
     print(explanation)                                              # speeds, causes, and the fastest contact
 
-The sliding speed of a contact is the norm of v_t = J_t v+ - target, the tangential relative velocity after the step
-minus the velocity of the surface, such as a conveyor belt's. Softened friction rows (with compliance) are an exception:
-their target is the damping of an engine and not the velocity of a surface, unless `surface_velocity` is given. v_t is
-computed from the impulses of these variants; each variant includes the replacements of the variants above it:
-
-    engine      the engine's answer
-    solved      the exact solution of the engine's own problem
-    disk        a round friction cone in place of a pyramid or box
-    hard        friction rows without compliance and with the surface's velocity as target, in place of softened ones
-    coulomb     Coulomb's law in place of the convex relaxation
-
-The difference of v_t between two consecutive variants is the part of the slip that the replaced property causes:
-unfinished iterations, the shape of the cone, compliance, the relaxation. The sliding in the last variant remains under
-Coulomb's law with friction at its limit, mu times the normal force: the contact slid before the step, or the load along
-the surface is above this limit. The parts are norms of vector differences, so the parts of one contact can add up to
-more than its speed.
+The sliding velocity of a contact is v_t = J_t v+ - surface, the tangential relative velocity after the step minus the
+velocity of the surface, such as a conveyor belt's; the one of a joint with dry friction is its velocity. With the
+direction u of v_t, the speed u . v_t is a sum: the parts of `lavender.compare` (unfinished solving, the integrator,
+softness, the shape of the cone, the convex relaxation) and the sliding that remains by the rigid laws. There, friction
+is at its limit, mu times the normal force: the contact slid before the step, or the load along the surface is above
+this limit. Parts may be negative, if a cause reduces the slip.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, check_float
+from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
-from lavender.judge.residuals import residual
+from lavender.causes.comparison import Comparison, compare
+from lavender.causes.difference import Part
+from lavender.causes.problems import record_of_problem
+from lavender.io import mujoco as adapter
+from lavender.io.mujoco_step import step_from_mujoco
+from lavender.io.step_record import ConstraintBlock, StepRecord, get_force
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
 from lavender.report.text import NONE, format_size, format_sizes
-from lavender.solving.solve import solve
 
-#: {variant: cause of its difference from the next variant}, in the order of replacement.
+#: Part of a comparison -> cause in words, in the order of tables.
 CAUSES = {
-    "engine": "unfinished solving",
-    "solved": "shape of the cone",
-    "disk": "softness of friction",
-    "hard": "convex relaxation",
-    "coulomb": "sliding at the friction limit",
+    "solver": "unfinished solving",
+    "lost digits": "lost digits of the forces",
+    "noslip": "pass against slip",
+    "integrator": "integrator",
+    "softness": "softness",
+    "shape": "shape of the cone",
+    "law": "convex relaxation",
+    "rest": "not explained",
+    "rigid": "sliding at the friction limit",
 }
+UNKNOWN_SURFACE = "speed of the surface is not known"
+# [-] Friction at a smaller part of its limit does not slide at the limit: the surface may move.
+MIN_USE_OF_SLIDING = 0.5
 # [m/s] Slip below this speed is not explained. It is far below the speeds at which objects slip out of a gripper, and
 # above the velocity error of solutions to a relative residual of 1e-9.
 MIN_EXPLAINED_SLIP = 1e-6
@@ -55,25 +56,6 @@ REMEDY_STEPS = 25  # Settings are compared by their mean slip in this number of 
 MAX_REMAINING_SLIP = 0.9  # A setting helps if at most this fraction of the slip remains.
 # A contact slid already before the step if it then had at least this fraction of its speed after the step.
 MIN_EARLIER_FRACTION = 0.5
-UNDEFINED_LAW = "Coulomb's law is not defined for its round cones"
-
-
-@dataclass(frozen=True, eq=False)
-class SlipVariant:
-    """Slip of the chosen contacts in one variant of the step."""
-
-    name: str  # Key of `CAUSES`.
-    # [m/s] tuple of (tangents,) arrays: tangential velocity of each contact after the step.
-    velocity: tuple[FloatArray, ...]
-    # Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
-    relative: float
-    # Reason why the variant equals the previous one, or why its solution is not accepted; "" otherwise.
-    note: str = ""
-
-    @property
-    def speeds(self) -> FloatArray:
-        """Sliding speed of each contact [m/s]."""
-        return np.array([np.linalg.norm(v) for v in self.velocity])
 
 
 @dataclass(frozen=True)
@@ -120,14 +102,20 @@ class Remedy:
 
 @dataclass(frozen=True, eq=False)
 class SlipExplanation:
-    """Slip of contacts in each variant of one step; `str()` gives the table and the sentences."""
+    """Slip of contacts after one step with its parts by cause; `str()` gives the table and the sentences."""
 
-    contacts: tuple[str, ...]  # Names of the chosen contacts.
-    variants: tuple[SlipVariant, ...]  # In the order of replacement.
-    speeds_before: FloatArray | None = (
-        None  # (contacts,) m/s: sliding speed before the step, if it is known.
-    )
-    # (contacts,): friction force of the engine's answer divided by mu times the normal force, if it is known.
+    contacts: tuple[str, ...]  # Names of the chosen contacts, or of joints.
+    speeds: FloatArray  # (contacts,) m/s, rad/s: sliding speed after the engine's step.
+    # (contacts,) m/s, rad/s by cause: the parts sum to the speeds.
+    parts: dict[str, FloatArray]
+    # (contacts, 2) m/s, rad/s by cause: smallest and largest part, over the orders of exchange.
+    intervals: dict[str, FloatArray]
+    rigid_speeds: FloatArray  # (contacts,) m/s, rad/s: sliding speed by the rigid laws.
+    comparison: Comparison  # Of the rigid laws and the engine.
+    units: tuple[str, ...] = ()  # Of each contact: m/s, or rad/s of a rotating joint.
+    # (contacts,) m/s, rad/s: sliding speed before the step, if it is known.
+    speeds_before: FloatArray | None = None
+    # (contacts,): friction force of the engine's answer divided by its limit; nan without a normal force.
     friction_use: FloatArray | None = None
     # Settings that were simulated, if the model is known and this is its state with the fastest contact.
     remedies: tuple[Remedy, ...] = ()
@@ -140,26 +128,21 @@ class SlipExplanation:
         return "\n".join([format_cells(self.table).to_string(index=False), *self.sentences])
 
     @property
-    def parts(self) -> dict[str, FloatArray]:
-        """Part of each contact's slip (contacts,) [m/s] by its cause."""
-        following = [v.velocity for v in self.variants[1:]]
-        zero = tuple(np.zeros_like(v) for v in self.variants[-1].velocity)
-        parts = {}
-        for variant, after in zip(self.variants, [*following, zero], strict=True):
-            changes = [np.linalg.norm(a - b) for a, b in zip(variant.velocity, after, strict=True)]
-            parts[CAUSES[variant.name]] = np.array(changes)
-        return parts
+    def slips(self) -> pd.DataFrame:
+        """Slip of each contact and its parts by cause [m/s, rad/s], and the dominant cause."""
+        columns = {"contact": self.contacts, "points": 1, "speed": self.speeds, **self.parts}
+        slips = _add_dominant_cause(pd.DataFrame(columns))
+        if self.friction_use is not None:
+            # Sliding at the friction limit has a friction force at this limit.
+            unused = np.nan_to_num(self.friction_use, nan=1.0) < MIN_USE_OF_SLIDING
+            is_wrong = unused & (slips["cause"] == CAUSES["rigid"]).to_numpy(bool)
+            slips.loc[is_wrong, "cause"] = UNKNOWN_SURFACE
+        return slips
 
     @property
-    def slips(self) -> pd.DataFrame:
-        """Slip of each contact and its parts by cause [m/s], and the dominant cause."""
-        columns = {
-            "contact": self.contacts,
-            "points": 1,
-            "speed": self.variants[0].speeds,
-            **self.parts,
-        }
-        return _add_dominant_cause(pd.DataFrame(columns))
+    def unit(self) -> str:
+        """Unit of the speeds: m/s, rad/s, or both."""
+        return ", ".join(sorted(set(self.units))) or "m/s"
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -168,8 +151,8 @@ class SlipExplanation:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Sliding speed of each contact [m/s], its largest part and the cause of this part."""
-        return tabulate_slip(self.slips).drop(columns="points")
+        """Sliding speed of each contact [m/s, rad/s], its largest part and the cause of this part."""
+        return tabulate_slip(self.slips, self.unit).drop(columns="points")
 
     @property
     def remedies_table(self) -> pd.DataFrame:
@@ -229,33 +212,57 @@ class SlipExplanation:
         """Sentences about the contact with the largest slip: its cause and its state."""
         if not self.contacts:
             return ["No contact was chosen."]
-        i = int(np.argmax(self.variants[0].speeds))
+        i = int(np.argmax(self.speeds))
         slip = self.slips.iloc[i]
+        unit = self.units[i] if self.units else "m/s"
         if slip["cause"] == "no slip":
-            return [f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} m/s."]
-        lines = [
-            f"Fastest: {slip['contact']} with {format_size(slip['speed'])} m/s.",
-            f"Largest part: {slip['cause']}, {format_size(slip['part'])} m/s.",
-        ]
+            return [f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} {unit}."]
+        lines = [f"Fastest: {slip['contact']} with {format_size(slip['speed'])} {unit}."]
+        if slip["cause"] == UNKNOWN_SURFACE:
+            lines.append(
+                "Its friction force is far below its limit, so that it does not slide at this limit: the speed of its "
+                "surface is not known. Give surface_velocity, if the surface moves."
+            )
+        else:
+            lines.append(f"Largest part: {self._describe_part(slip['cause'], i)} {unit}.")
+        ranked = sorted(self.parts, key=lambda cause: -self.parts[cause][i])
+        _, high = self.intervals[ranked[1]][i]
+        low, _ = self.intervals[ranked[0]][i]
+        if high > low and high > MIN_EXPLAINED_SLIP:
+            lines.append(
+                f"The order of exchange decides; also: {self._describe_part(ranked[1], i)} {unit}."
+            )
         use = None if self.friction_use is None else float(self.friction_use[i])
         has_force = use is None or not np.isnan(use)
+        is_joint = not slip["contact"].startswith("contact")
         if self.speeds_before is not None:
             before = float(self.speeds_before[i])
-            after = float(self.variants[-1].speeds[i])
-            lines.append(f"Before the step it slid with {format_size(before)} m/s.")
-            if slip["cause"] == CAUSES["coulomb"] and before >= MIN_EARLIER_FRACTION * after:
+            after = float(self.rigid_speeds[i])
+            lines.append(f"Before the step it slid with {format_size(before)} {unit}.")
+            if slip["cause"] == CAUSES["rigid"] and before >= MIN_EARLIER_FRACTION * after:
                 slows = "slows it" if after < before else "does not slow it"
                 lines.append(f"The cause is that it slid already; friction {slows}.")
-            elif slip["cause"] == CAUSES["coulomb"] and has_force:
-                lines.append("The load along the surface is above mu times the normal force.")
+            elif slip["cause"] == CAUSES["rigid"] and has_force:
+                limit = "its dry friction" if is_joint else "mu times the normal force"
+                lines.append(f"The load along the surface is above {limit}.")
         if not has_force:
             no_force = "has no normal force at this contact, and therefore no friction"
             lines.append(f"The engine's answer {no_force}.")
         elif use is not None:
-            share = f"{100.0 * use:.0f} % of mu times the normal force"
+            limit = "its limit" if is_joint else "mu times the normal force"
+            share = f"{100.0 * use:.0f} % of {limit}"
             lines.append(f"In the engine's answer its friction force is {share}.")
-        noted = [v for v in self.variants if v.note.startswith(("not", UNDEFINED_LAW))]
-        return lines + [f"Variant {v.name!r}: {v.note}." for v in noted]
+        return lines
+
+    def _describe_part(self, cause: str, i: int) -> str:
+        """Return the part of a cause with its interval."""
+        mean, (low, high) = self.parts[cause][i], self.intervals[cause][i]
+        text = f"{cause}, {format_size(mean)}"
+        return (
+            f"{text} ({format_size(low)} to {format_size(high)})"
+            if high - low > 0.05 * abs(mean)
+            else text
+        )
 
     @property
     def advice(self) -> list[str]:
@@ -296,32 +303,28 @@ class SlipExplanation:
 
 
 def explain_slip(
-    problem: Problem,
-    impulse: Any,
+    problem: Problem | StepRecord,
+    impulse: Any = None,
     *,
     contacts: Sequence[int] | Sequence[str] | str | None = None,
-    disk: Problem | None = None,
     surface_velocity: Any = None,
-    tol: float = 1e-9,
 ) -> SlipExplanation:
-    """Divide the slip of contacts after a step into parts by their causes.
+    """Divide the slip of contacts, or the motion of joints with dry friction, after a step into parts by their causes.
 
     Parameters
     ----------
-    problem : Problem
-        The engine's problem, in generalised coordinates or with bodies.
-    impulse : (m,) N s
-        The engine's answer.
+    problem : Problem or StepRecord
+        The engine's problem, in generalised coordinates or with bodies. If `lavender.io.from_mujoco` made it from data
+        that have not changed since, MuJoCo's whole step is known: pyramids as contacts, the surfaces' velocities, and
+        the integrator. Or the record of a step.
+    impulse : (m,) N s, optional
+        The engine's answer, of a problem.
     contacts : block indices, names or a part of names, optional
-        Contacts to explain, of `disk` if it is given. Default: all contacts with tangents.
-    disk : Problem, optional
-        The problem of the same step with friction cones in place of pyramids, over the same velocities. It is needed
-        if the rows of `problem` are edges of pyramids, because such rows do not show which rows form a contact.
-    surface_velocity : (rows,), m/s, optional
-        Velocity of the surface along each row of `disk` if it is given, else of `problem`; only its friction rows are
-        read. Default: the target of rows without compliance, 0 on rows with compliance.
-    tol : float, default 1e-9
-        Relative residual to which each variant is solved.
+        Contacts, joints with dry friction, or limits to explain. Default: all contacts with friction; if there are
+        none, all joints with dry friction and all limits.
+    surface_velocity : (m,), m/s, optional
+        Velocity of the surface along each row of a problem; only its friction rows are read. Default: the target of
+        rows without compliance, 0 on rows with compliance.
 
     Returns
     -------
@@ -330,145 +333,153 @@ def explain_slip(
     Raises
     ------
     InputError
-        No contact has tangents, a name fits none, the impulse has another shape, or the problems have different
-        velocities.
+        Nothing can slip, a name fits none, or the impulse has another shape.
     CapabilityError
-        The problem is a matrix: velocities after the step are not known.
+        The problem is a matrix, so that velocities after the step are not known; or it is too large.
     """
+    if isinstance(problem, StepRecord):
+        return explain_record(problem, contacts)
     check_problem(problem)
-    tol = check_float("tol", tol, above=0.0)
     answer = as_array("impulse", impulse, (problem.m,), unit="N s")
-    measured = problem if disk is None else disk
-    check_problem(measured)
-    blocks = _choose_contacts(measured, contacts)
-    free, own_free = (p.velocity(np.zeros(p.m)) for p in (measured, problem))
-    if own_free.shape != free.shape:
-        raise InputError(
-            f"disk has velocities of shape {free.shape} and problem of shape {own_free.shape}; both must "
-            "describe the same step of the same model"
-        )
-    if surface_velocity is None:
-        surface = find_surface_velocity(measured)
+    surface = None
+    if surface_velocity is not None:
+        surface = as_array("surface_velocity", surface_velocity, (problem.m,), unit="m/s")
     else:
-        surface = as_array("surface_velocity", surface_velocity, (measured.m,), unit="m/s")
-
-    def slip(changed: Problem, impulse: FloatArray) -> tuple[FloatArray, ...]:
-        return compute_slip(measured, blocks, changed.velocity(impulse).ravel(), surface)
-
-    motion = problem.__dict__.get("engine_motion")
-    velocity = problem.velocity(answer)
-    if (
-        motion is not None
-        and motion.moved_by == "acceleration"
-        and np.array_equal(motion.impulse, answer)
-    ):
-        velocity = own_free + motion.change
-    own_slip = compute_slip(measured, blocks, velocity.ravel(), surface)
-    variants = [SlipVariant("engine", own_slip, residual(problem, answer).relative)]
-
-    def solve_and_add_variant(
-        name: str, changed: Problem, start: FloatArray | None, note: str = ""
-    ) -> FloatArray:
-        if note:
-            last = variants[-1]
-            variants.append(replace(last, name=name, note=note))
-            return np.zeros(0) if start is None else start
-        solution = solve(changed, impulse=start, tol=tol)
-        is_solved = solution.residual.relative <= max(tol, solution.residual.roundoff_floor)
-        failed = "" if is_solved else f"not solved: {solution.status.name}"
-        own = slip(changed, solution.impulse)
-        variants.append(SlipVariant(name, own, solution.residual.relative, failed))
-        return solution.impulse
-
-    start = solve_and_add_variant("solved", problem, answer)
-    own_disk = measured
-    if disk is None and problem.cones.has_box:
-        own_disk = replace(problem, cones=problem.cones.shaped("disk"))
-    same = start if own_disk.m == problem.m else None
-    start = solve_and_add_variant(
-        "disk", own_disk, same, "cones are round" if own_disk is problem else ""
-    )
-    hard, has_soft_friction = _replace_soft_friction(own_disk, surface)
-    start = solve_and_add_variant(
-        "hard", hard, start, "" if has_soft_friction else "friction rows are hard"
-    )
-    law_note = UNDEFINED_LAW if hard.cones.has_round else ""
-    law_note = "the law is Coulomb's" if hard.friction == "coulomb" else law_note
-    rigid = hard if law_note else hard.relaxed("coulomb")
-    start = solve_and_add_variant("coulomb", rigid, start, law_note)
-    names = tuple(measured.block_name(k) for k in blocks)
-    return SlipExplanation(names, tuple(variants))
+        model, data, is_stepped = adapter.find_source(problem)
+        if (
+            data is not None
+            and not is_stepped
+            and np.array_equal(answer, adapter.impulse(model, data))
+        ):
+            return explain_record(step_from_mujoco(model, data), contacts)
+    return explain_record(record_of_problem(problem, answer, surface), contacts, has_start=False)
 
 
-def compute_slip(
-    problem: Problem, blocks: Sequence[int], velocity: FloatArray, surface: FloatArray
-) -> tuple[FloatArray, ...]:
-    """Return the tangential velocity of each contact minus the surface's (tangents,) [m/s]."""
-    jacobian = problem.jacobian.tocsr()
-    cones = problem.cones
-    starts = [int(cones.ptr[k]) + 1 for k in blocks]
-    counts = [min(2, int(cones.n_tangents[k])) for k in blocks]
-    rows_of_contacts = [slice(start, start + n) for start, n in zip(starts, counts, strict=True)]
-    return tuple(jacobian[rows] @ velocity - surface[rows] for rows in rows_of_contacts)
+def explain_record(
+    record: StepRecord, contacts: Any = None, has_start: bool = True
+) -> SlipExplanation:
+    """Explain the slip in a recorded step; `has_start`: its velocity is the one before the step."""
+    chosen = _choose_blocks(record, contacts)
+    names = name_blocks(record)
+    found = compare(record)
+    velocities = [read_slip(record.blocks[k]) for k in chosen]
+    speeds, rigid, uses, before = [], [], [], []
+    parts: dict[str, list[float]] = {cause: [] for cause in CAUSES.values()}
+    intervals: dict[str, list[tuple[float, float]]] = {cause: [] for cause in CAUSES.values()}
+    flat = _flatten_parts(found)
+    for k, (rows, surface) in zip(chosen, velocities, strict=True):
+        slip = rows @ record.velocity_after - surface
+        ideal = rows @ found.a.velocity_after - surface
+        speed = float(np.linalg.norm(slip))
+        direction = slip / speed if speed > 0.0 else np.eye(len(slip))[0]
+        row = direction @ rows
+        for name, cause in CAUSES.items():
+            part = flat.get(name)
+            values = (0.0, 0.0, 0.0) if part is None else part.measure(row)
+            if name == "rigid":
+                values = (float(direction @ ideal),) * 3
+            parts[cause].append(values[0])
+            intervals[cause].append(values[1:])
+        speeds.append(speed)
+        rigid.append(float(np.linalg.norm(ideal)))
+        before.append(float(np.linalg.norm(rows @ record.velocity - surface)))
+        uses.append(measure_friction_use(record.blocks[k]))
+    return SlipExplanation(
+        tuple(names[k] for k in chosen), np.array(speeds),
+        {cause: np.array(x) for cause, x in parts.items()},
+        {cause: np.array(x) for cause, x in intervals.items()}, np.array(rigid), found,
+        units=tuple(_find_unit(record, record.blocks[k]) for k in chosen),
+        speeds_before=np.array(before) if has_start else None, friction_use=np.array(uses),
+    )  # fmt: skip
 
 
-def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
-    """Return the indices of the chosen contacts."""
-    sliding = np.flatnonzero(problem.cones.n_tangents > 0).tolist()
-    if not sliding:
-        raise InputError("the problem has no contact with tangents; give disk= for pyramids")
+def _flatten_parts(comparison: Comparison) -> dict[str, Part]:
+    """Return the parts by name, with the parts within friction; coefficients do not differ from the rigid laws'."""
+    parts = dict(comparison.parts)
+    friction = parts.pop("friction", None)
+    return parts | ({} if friction is None else {p.name: p for p in friction.parts})
+
+
+def name_blocks(record: StepRecord) -> list[str]:
+    """Return the names of the blocks, with the numbers and geoms of contacts."""
+    names, number = [], 0
+    for block in record.blocks:
+        if block.geoms:
+            names.append(f"contact {number} ({', '.join(block.geoms)})")
+        else:
+            names.append(block.key)
+        number += block.role == "contact"
+    return names
+
+
+def read_slip(block: ConstraintBlock) -> tuple[FloatArray, FloatArray]:
+    """Return the rows and the surface's velocity of a block's slip: up to two tangents, or the row of a joint."""
+    first, count = (1, min(2, block.condim - 1)) if block.role == "contact" else (0, 1)
+    rows = block.jacobian[first : first + count]
+    moving = block.surface_velocity
+    surface = np.zeros(count) if moving is None else moving[first : first + count]
+    return rows, surface
+
+
+def _find_unit(record: StepRecord, block: ConstraintBlock) -> str:
+    """Return the unit of a block's slip."""
+    moved = record.angular[np.abs(block.jacobian[0]) > 0.0]
+    return "rad/s" if block.role != "contact" and len(moved) and moved.all() else "m/s"
+
+
+def measure_friction_use(block: ConstraintBlock) -> float:
+    """Return the friction force of the engine's answer divided by its limit; nan without a normal force."""
+    force = get_force(block)
+    if block.role == "friction":
+        return abs(float(force[0])) / block.loss if block.loss > 0.0 else float("nan")
+    if block.role != "contact":
+        return float("nan")
+    count = min(2, block.condim - 1)
+    tangents = force[1 : 1 + count] / block.friction[:count]
+    return float(np.linalg.norm(tangents)) / float(force[0]) if force[0] > 0.0 else float("nan")
+
+
+def _choose_blocks(record: StepRecord, contacts: Any) -> list[int]:
+    """Return the indices of the chosen blocks."""
+    names = name_blocks(record)
+    touching = [k for k, x in enumerate(record.blocks) if x.has_friction]
+    rubbing = [
+        k for k, x in enumerate(record.blocks)
+        if x.role in ("friction", "limit") or (x.role == "bounds" and _is_dry_friction(x))
+    ]  # fmt: skip
+    if not touching and not rubbing:
+        raise InputError(
+            "the step has no contact with tangents, no dry friction and no limit; rows of pyramids do not show their "
+            "contacts: give the record of the step (lavender.io.step_from_mujoco)"
+        )
     if contacts is None:
-        return sliding
+        return touching or rubbing
     chosen: list[int] = []
+    valid = sorted(touching + rubbing)
     for entry in [contacts] if isinstance(contacts, str) else contacts:
         if isinstance(entry, str):
-            fitting = [k for k in sliding if entry in problem.block_name(k)]
+            fitting = [k for k in valid if entry in names[k]]
             if not fitting:
-                known = ", ".join(problem.block_name(k) for k in sliding[:8])
+                known = ", ".join(names[k] for k in valid[:8])
                 raise InputError(
                     f"contacts names {entry!r}, which no contact's name contains; they are {known}"
                 )
             chosen += fitting
-        elif entry in sliding:
+        elif entry in valid:
             chosen.append(int(entry))
         else:
-            known = f"give one of the blocks {sliding[:20]}"
+            known = f"give one of the blocks {valid[:20]}"
             raise InputError(
                 f"contacts names {entry!r}, which is not a contact with tangents; {known}"
             )
     return list(dict.fromkeys(chosen))
 
 
-def _compute_free_row_velocities(problem: Problem) -> FloatArray:
-    """Return J v* (m,) [m/s]."""
-    return np.asarray(problem.jacobian @ problem.velocity(np.zeros(problem.m)).ravel())
-
-
-def find_surface_velocity(problem: Problem) -> FloatArray:
-    """Return the target (m,) [m/s] of rows without compliance, 0 on other rows and if the target is rounding."""
-    free = _compute_free_row_velocities(problem)
-    target = problem.b + free
-    # The target is computed as b + J v*.
-    target[np.abs(target) <= 8.0 * np.finfo(float).eps * (np.abs(problem.b) + np.abs(free))] = 0.0
-    return target if problem.compliance is None else np.where(problem.compliance > 0.0, 0.0, target)
-
-
-def _replace_soft_friction(problem: Problem, surface: FloatArray) -> tuple[Problem, bool]:
-    """Return the problem with hard friction rows at the velocity of the surface (m,), and whether a row changed."""
-    rows = problem.cones.friction_rows
-    wanted = surface[rows] - _compute_free_row_velocities(problem)[rows]
-    soft = np.zeros(problem.m) if problem.compliance is None else np.array(problem.compliance)
-    rounding = (
-        8.0
-        * np.finfo(float).eps
-        * (np.abs(problem.b[rows]) + np.abs(wanted) + np.abs(surface[rows]))
-    )
-    if not soft[rows].any() and not (np.abs(problem.b[rows] - wanted) > rounding).any():
-        return problem, False
-    b = np.array(problem.b)
-    b[rows] = wanted
-    soft[rows] = 0.0
-    return replace(problem, b=b, compliance=soft), True
+def _is_dry_friction(block: ConstraintBlock) -> bool:
+    """Return whether the bounds of a row are a friction loss."""
+    assert block.bounds is not None
+    lower, upper = block.bounds
+    return len(lower) == 1 and bool(np.isfinite(upper[0])) and float(upper[0]) == -float(lower[0])
 
 
 def get_geoms(contact: str) -> str:
@@ -496,13 +507,13 @@ def average_slip(explanations: Iterable[SlipExplanation]) -> pd.DataFrame:
     return _add_dominant_cause(means.reset_index())
 
 
-def tabulate_slip(slips: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of contacts, with speeds in m/s; a contact without slip has no part."""
+def tabulate_slip(slips: pd.DataFrame, unit: str = "m/s") -> pd.DataFrame:
+    """Return a table of contacts, with their speeds; a contact without slip has no part."""
     heads = {
         "contact": "contact",
         "points": "points",
-        "speed": "slip [m/s]",
-        "part": "largest part [m/s]",
+        "speed": f"slip [{unit}]",
+        "part": f"largest part [{unit}]",
         "cause": "cause of this part",
     }
     return slips[list(heads)].rename(columns=heads)

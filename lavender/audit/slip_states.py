@@ -21,20 +21,19 @@ from lavender.audit.slip import (
     Remedy,
     SlipExplanation,
     average_slip,
-    compute_slip,
-    explain_slip,
-    find_surface_velocity,
+    explain_record,
     get_geoms,
+    name_blocks,
+    read_slip,
     tabulate_slip,
 )
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import markupsafe
 from lavender.base.lazy_import import pandas as pd
-from lavender.io import mujoco as adapter
 from lavender.io.mujoco_memory import import_mujoco
+from lavender.io.mujoco_step import step_from_mujoco
 from lavender.io.start_states import name_model, read_states, without_sleep
-from lavender.problem import Problem
 from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
@@ -110,12 +109,13 @@ class SlipOfStates:
             )
         blocks: list[Any] = []
         if folder is not None:
-            total = float(first[list(CAUSES.values())].sum()) or 1.0
+            shares = first[list(CAUSES.values())].astype(float).clip(lower=0.0)
+            total = float(shares.sum()) or 1.0
             parts = [
                 (
                     cause,
                     f"var(--s{i})",
-                    float(first[cause]) / total,
+                    float(shares[cause]) / total,
                     [format_speed(first[cause])],
                     "",
                 )
@@ -232,29 +232,16 @@ def _is_diverging(mj: Any, data: Any) -> bool:
 
 def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
     """Explain the step after a forward pass; None if no chosen contact has friction."""
-    problem, disk, surface = _read_step(mj, model, data)
-    measured = problem if disk is None else disk
-    blocks = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-    names = [measured.block_name(k) for k in blocks]
+    record = step_from_mujoco(model, data)
+    names = [
+        name
+        for name, block in zip(name_blocks(record), record.blocks, strict=True)
+        if block.has_friction
+    ]
     touching = [entry for entry in entries if any(entry in name for name in names)]
     if not names or (entries and not touching):
         return None
-    answer = adapter.impulse(model, data)
-    explanation = explain_slip(
-        problem, answer, contacts=touching or None, disk=disk, surface_velocity=surface
-    )
-    chosen = [blocks[names.index(name)] for name in explanation.contacts]
-    slips = compute_slip(measured, chosen, data.qvel, surface)
-    # Friction force divided by mu times the normal force; nan without a normal force.
-    use = np.full(len(chosen), np.nan)
-    force = np.empty(6)
-    for i, name in enumerate(explanation.contacts):
-        k = int(name.split()[1])
-        mj.mj_contactForce(model, data, k, force)
-        if force[0] > 0.0:
-            use[i] = np.hypot(*(force[1:3] / data.contact[k].friction[:2])) / force[0]
-    speeds = np.array([np.linalg.norm(v) for v in slips])
-    return replace(explanation, speeds_before=speeds, friction_use=use)
+    return explain_record(record, touching or None)
 
 
 def _simulate_remedies(
@@ -263,7 +250,7 @@ def _simulate_remedies(
     """Simulate settings from the states in which the fastest contact slides fastest, and add their results."""
     fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0])
     speed, pair = _find_fastest(explanations[fastest])
-    i = int(np.argmax(explanations[fastest].variants[0].speeds))
+    i = int(np.argmax(explanations[fastest].speeds))
     use = explanations[fastest].friction_use
     if not speed > MIN_EXPLAINED_SLIP or (use is not None and np.isnan(use[i])):
         return  # No setting changes the slip of a contact without normal force.
@@ -298,27 +285,6 @@ def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
     """Return the sliding speed of the fastest contact [m/s] and the names of its geoms."""
     slips = explanation.slips
     return max(zip(slips["speed"], slips["contact"].map(get_geoms), strict=True))
-
-
-def _read_step(mj: Any, model: Any, data: Any) -> tuple[Problem, Problem | None, FloatArray]:
-    """Return a step's problem, the one with disks if cones are pyramids, and velocities of the surfaces."""
-    problem = adapter.from_mujoco(model, data)
-    disk = None
-    final = data
-    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
-        round_model = copy.deepcopy(model)
-        round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
-        final = mj.MjData(round_model)
-        state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-        mj.mj_setState(round_model, final, state, mj.mjtState.mjSTATE_INTEGRATION)
-        mj.mj_forward(round_model, final)
-        disk = adapter.from_mujoco(round_model, final)
-    measured = problem if disk is None else disk
-    if not getattr(model, "flg_surfacevel", False):
-        return problem, disk, find_surface_velocity(measured)
-    # MuJoCo subtracts the surfaces' velocities from J v.
-    return problem, disk, measured.jacobian @ data.qvel - final.efc_vel
 
 
 def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any]]:
@@ -367,14 +333,16 @@ def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[
             mj.mj_forward(model, data)
             if _is_diverging(mj, data):
                 return means, step
-            problem, disk, surface = _read_step(mj, model, data)
-            measured = problem if disk is None else disk
-            sliding = np.flatnonzero(measured.cones.n_tangents > 0).tolist()
-            blocks = [k for k in sliding if get_geoms(measured.block_name(k)) == geoms]
+            record = step_from_mujoco(model, data)
             mj.mj_step(model, data)
         except mj.FatalError:
             return means, step
-        speeds = [np.linalg.norm(v) for v in compute_slip(measured, blocks, data.qvel, surface)]
+        names = name_blocks(record)
+        sliding = [
+            read_slip(block) for name, block in zip(names, record.blocks, strict=True)
+            if block.has_friction and get_geoms(name) == geoms
+        ]  # fmt: skip
+        speeds = [np.linalg.norm(rows @ data.qvel - surface) for rows, surface in sliding]
         if speeds:
             means[step] = np.mean(speeds)
     return means, -1

@@ -20,15 +20,17 @@ from lavender.io.step_record import Softness, StepRecord
 # [-] Compliance of the twin's rows relative to J M^-1 J^T. It makes impulses of redundant rows unique, and changes
 # velocities by about this part of themselves.
 RIGID_COMPLIANCE = 1e-9
+ROUND_CONES = {"pyramid": "ellipse", "box": "ellipse"}
 
 
 def make_ideal_twin(record: StepRecord) -> StepRecord:
     """Return the record of the same step by the rigid laws; see the module."""
     rigid = Softness("rigid", compliance=np.array([RIGID_COMPLIANCE]))
     blocks = tuple(
-        replace(x, softness=rigid, cone="ellipse" if x.cone else "", force=None)
+        replace(x, softness=rigid, cone=ROUND_CONES.get(x.cone, x.cone), force=None)
         for x in record.blocks
     )
+    has_springs = any(x.softness.rule == "impedance" for x in record.blocks)
     added = record.added_matrix
     if not record.uses_damping:
         added = added + record.dt * record.damping_matrix
@@ -38,7 +40,7 @@ def make_ideal_twin(record: StepRecord) -> StepRecord:
     rest[np.abs(rest) < 1e-12 * np.abs(record.mass).max()] = 0.0
     twin = replace(
         record, engine="rigid", blocks=blocks, uses_damping=True, integrator_matrix=rest,
-        in_problem=True, implicit_rows=True, law="coulomb", acceleration=None,
+        in_problem=True, implicit_rows=has_springs or record.implicit_rows, law="coulomb", acceleration=None,
         before_noslip=None, softnesses=dict.fromkeys(record.softnesses, rigid),
         settings={"family": "ideal"},
     )  # fmt: skip

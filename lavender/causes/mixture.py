@@ -68,9 +68,12 @@ class _Rows:
     jacobian: FloatArray
     target: FloatArray
     compliance: FloatArray
-    kind: str  # "contact", "limit", "equality" or "friction".
-    mu: float = 0.0
+    kind: str  # "contact", "limit", "equality", "friction" or "bounds".
+    mu: FloatArray
+    cone: str = ""
     loss: float = 0.0
+    bounds: FloatArray | None = None  # (2, k) N, N m
+    own_cones: Cones | None = None
 
 
 def solve_mixture(
@@ -130,7 +133,7 @@ def solve_mixture(
 def _choose_law(sources: Mapping[str, StepRecord], rows: list[_Rows]) -> str:
     """Return the law: Coulomb's is defined for contacts of up to two tangents."""
     law = sources["law"].law
-    is_wide = any(x.kind == "contact" and len(x.jacobian) > 3 for x in rows)
+    is_wide = any(x.kind == "contact" and len(x.jacobian) > 3 and x.own_cones is None for x in rows)
     return "cone" if is_wide else law
 
 
@@ -208,7 +211,15 @@ def _make_rows(
     if cone == "pyramid":
         kind = "limit"
     return _Rows(
-        edges @ jac, edges @ target, compliance, kind, float(mu[0]) if len(mu) else 0.0, loss.loss
+        edges @ jac,
+        edges @ target,
+        compliance,
+        kind,
+        mu,
+        cone,
+        loss.loss,
+        block.bounds,
+        block.own_cones,
     )
 
 
@@ -223,6 +234,8 @@ def make_edges(cone: str, mu: FloatArray, k: int) -> FloatArray:
             edges[2 * j, j + 1] = coefficient
             edges[2 * j + 1, j + 1] = -coefficient
         return edges
+    if cone in ("box", "own"):
+        return np.eye(k)
     return np.diag(np.append(1.0, mu / mu[0]))
 
 
@@ -289,8 +302,14 @@ def _find_compliance(
 def _make_cones(rows: _Rows, dt: float) -> Cones:
     """Return the bounds or the cone of the rows of a block."""
     k = len(rows.jacobian)
+    if rows.own_cones is not None:
+        return rows.own_cones
+    if rows.kind == "contact" and rows.cone == "box":
+        return Cones.contacts(rows.mu[None, :2], shape="box")
     if rows.kind == "contact":
-        return Cones.contacts(rows.mu, tangents=k - 1)
+        return Cones.contacts(float(rows.mu[0]), tangents=k - 1)
+    if rows.bounds is not None:
+        return Cones.bounded(dt * rows.bounds[0], dt * rows.bounds[1])
     upper = np.full(k, np.inf)
     if rows.kind == "friction":
         return Cones.bounded(np.full(k, -dt * rows.loss), np.full(k, dt * rows.loss))

@@ -17,7 +17,7 @@ from lavender.cli.options import print_escaped
 COMMAND_GROUPS = {
     "Solve and judge": ("solve", "check", "explain"),
     "Measure": ("report",),
-    "MuJoCo": ("record", "audit", "tune", "slip"),
+    "MuJoCo": ("record", "audit", "tune", "slip", "compare"),
     "Engine": ("run", "web"),
     "Tools": ("solvers", "contract", "doctor", "export"),
 }

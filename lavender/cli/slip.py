@@ -45,11 +45,11 @@ def slip(
     """Explain why contacts of a MuJoCo model slip.
 
     MODEL is an MJCF or .mjb file. The first table shows the speed of each contact along its surface after the step, and
-    the largest part of this speed with its cause: unfinished solving, shape of the cone, softness of friction, convex
-    relaxation, or sliding at the friction limit. A part is the change of the speed if this property is replaced, too:
-    exact solution, round cone, hard friction, Coulomb's law. Settings of MuJoCo are then simulated. The second table
-    shows the speed of the fastest contact with each, in the same step and as a mean of the next 25 steps; the last
-    lines name the settings that help.
+    the largest part of this speed with its cause: unfinished solving, the integrator, softness, shape of the cone,
+    convex relaxation, or sliding at the friction limit. The step is compared with the same step by the rigid laws, and
+    each part is a mean over all orders in which the causes can be exchanged, as by `lavender compare`. Settings of
+    MuJoCo are then simulated. The second table shows the speed of the fastest contact with each, in the same step and
+    as a mean of the next 25 steps; the last lines name the settings that help.
 
     Exit code 1: no state has a contact with friction.
     """

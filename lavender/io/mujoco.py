@@ -142,8 +142,8 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         if raised is not None:
             problem = replace(problem, compliance=raised)
     moved_by = find_mover(step, before is not None)
-    if before is not None:
-        problem.__dict__["engine_step"] = weakref.ref(data), model, np.array(data.qvel)
+    is_stepped = before is not None
+    problem.__dict__["engine_step"] = weakref.ref(data), model, np.array(data.qvel), is_stepped
     if step.m and (moved_by == "acceleration" or is_stiff) and not step.has_noslip:
         lam = _scale_force(step, data, get_row_scales(blocks))
         smooth = data.qacc_smooth if change is None else data.qacc_smooth + change
@@ -211,16 +211,29 @@ def compute_prediction_gap(problem: Problem) -> float:
     It is 0 up to rounding, 1e-9 of the largest velocity; and NaN if the problem was made before the step, if the data
     were stepped since, or if the velocity cannot be predicted.
     """
-    get_data, model, after = problem.__dict__.get("engine_step", (lambda: None, None, None))
-    data = get_data()
-    if data is None or not np.array_equal(data.qvel, after):
+    model, data, is_stepped = find_source(problem)
+    if data is None or not is_stepped:
         return float("nan")
+    after = data.qvel
     gap = float(np.abs(engine_answer(model, data).velocity - after).max(initial=0.0))
     return (
         gap
         if not gap <= PREDICTION_TOLERANCE * max(1.0, float(np.abs(after).max(initial=0.0)))
         else 0.0
     )
+
+
+def find_source(problem: Problem) -> tuple[Any, Any, bool]:
+    """Return the model and data from which a problem was made, and whether they were stepped before.
+
+    The data are None if they do not exist any more, or if their velocities have changed.
+    """
+    get_data, model, velocity, is_stepped = problem.__dict__.get(
+        "engine_step", (lambda: None, None, None, False)
+    )
+    data = get_data()
+    is_same = data is not None and np.array_equal(data.qvel, velocity)
+    return model, data if is_same else None, is_stepped
 
 
 def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray) -> FloatArray:

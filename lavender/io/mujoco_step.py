@@ -96,7 +96,7 @@ class _Reader:
         self.is_discrete = read_step(model, self.data).is_discrete
         self.jacobian = single.jacobian(model, self.data).toarray()
         self.bodies = [_name(model.body(i), "body", i) for i in range(model.nbody)]
-        self.geoms = [_name(model.geom(i), "geom", i) for i in range(model.ngeom)]
+        self.geoms = [model.geom(i).name or str(i) for i in range(model.ngeom)]
         self.joints = [_name(model.joint(i), "joint", i) for i in range(model.njnt)]
 
     def copy(self, data: Any) -> Any:
@@ -363,6 +363,8 @@ class _Reader:
             settings[name] = float(getattr(option, name))
         for name in ("iterations", "noslip_iterations"):
             settings[name] = int(getattr(option, name))
+        settings["control"] = tuple(map(float, self.data.ctrl))
+        settings["activation"] = tuple(map(float, self.data.act))
         return settings
 
     def read_blocks(self, mass: FloatArray, added: FloatArray) -> list[_Rows]:

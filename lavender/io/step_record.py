@@ -36,8 +36,6 @@ from lavender.base.errors import InputError
 from lavender.io.stored import as_path, write_arrays
 
 FORMAT = "lavender step record 1"
-ROLES = ("contact", "limit", "equality", "friction")
-CONES = ("", "pyramid", "ellipse")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +85,7 @@ class ConstraintBlock:
     ----------
     key : str
         Name of the partner in another engine's record: "contact of BODY and BODY", "limit of joint NAME", ...
-    role : {"contact", "limit", "equality", "friction"}
+    role : {"contact", "limit", "equality", "friction", "bounds"}
     jacobian : (k, nv)
         Rows of velocities without coefficients. A contact has its normal, two tangents, spin, and two rolling axes; or
         the first of them that are known.
@@ -98,8 +96,8 @@ class ConstraintBlock:
     weight : (k,), 1/kg, 1/(kg m^2)
         The engine's own inverse mass of each row, from which it makes R. One number for a contact.
     softness : Softness
-    cone : {"", "pyramid", "ellipse"}
-        Of a contact with friction.
+    cone : {"", "pyramid", "ellipse", "box", "own"}
+        Of a contact with friction. A box bounds each tangent.
     condim : int
         Number of rows of the contact that the engine uses.
     friction : (5,) or fewer, -, m
@@ -117,6 +115,10 @@ class ConstraintBlock:
     bodies : tuple of str
         Bodies of a contact, which name its weights in `StepRecord.weights`.
     position : (3,), m
+    bounds : (2, k), N, N m, optional
+        Lower and upper bounds of forces, of the role "bounds".
+    own_cones : Cones, optional
+        Of the cone "own", which no exchange changes.
     """
 
     key: str
@@ -136,6 +138,8 @@ class ConstraintBlock:
     geoms: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()
     position: FloatArray = field(default_factory=lambda: np.zeros(3))
+    bounds: FloatArray | None = None
+    own_cones: Any = None
 
     @property
     def has_friction(self) -> bool:

@@ -53,6 +53,7 @@ NEEDED = {
         "matplotlib",
         "rich",
         "joblib",
+        "scipy",  # The rows of the steps that are compared with the rigid laws.
     },
 }
 

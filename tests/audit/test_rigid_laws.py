@@ -1,0 +1,47 @@
+"""The causes that an audit names: of errors against the engine's own problem, and against the rigid laws."""
+
+import pytest
+
+from lavender.audit.audit import audit
+
+mujoco = pytest.importorskip("mujoco", minversion="4.0")
+
+LEVER = """<mujoco><option timestep="0.002" integrator="{}" tolerance="0" iterations="300" ls_iterations="100"/>
+<worldbody><geom type="box" size=".05 .05 .02" pos=".2 0 -.035"/><body><joint type="hinge" axis="0 1 0" damping=".01"/>
+<geom type="box" size=".3 .03 .02" mass=".2"/></body></worldbody></mujoco>"""
+HINGE = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
+<joint name="j" axis="0 0 1" frictionloss="100" damping="100"/><geom type="cylinder" size=".1 .05" mass="1"/></body>
+</worldbody></mujoco>"""
+STOPPED = """<mujoco><option timestep="0.002" gravity="3 0 -9" solver="PGS" iterations="1" tolerance="0"/><worldbody>
+<geom type="plane" size="9 9 1"/><body pos="0 0 .0998"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+</worldbody></mujoco>"""
+
+
+def read(xml, **options):
+    """Return the headline of an audit of a model."""
+    result = audit(mujoco.MjModel.from_xml_string(xml), worlds=2, steps=60, **options)
+    return result, " ".join(result.headline)
+
+
+def test_forces_without_digits_are_the_fault_of_the_integrator():
+    result, text = read(LEVER.format("implicitfast"), spread=0.2)
+    assert "Cause: the integrator" in text and "Cause: the solver" not in text
+    assert result.causes[0].own[0] == "lost digits"
+    _, text = read(LEVER.format("discrete"), spread=0.2)
+    assert "Cause" not in text
+
+
+def test_solver_that_stops_early_is_the_cause():
+    result, text = read(STOPPED)
+    assert "Cause: the solver" in text
+    assert result.causes[0].own[0] == "solver"
+
+
+def test_exact_step_that_damping_pushes_on_names_integrator_and_softness_with_intervals():
+    result, text = read(HINGE, spread=1.0)
+    assert "From the rigid laws, the velocity of j" in text
+    assert "integrator +" in text and "softness +" in text and "by order" in text
+    (cause,) = result.causes
+    assert cause.causes == ("integrator", "softness") and cause.own == ("", 0.0)
+    total = sum(mean for _, mean, _, _ in cause.parts)
+    assert total == pytest.approx(cause.difference, rel=1e-6)
