@@ -1,11 +1,15 @@
 // cannon-es; a hinge is a HingeConstraint, a belt a kinematic body.
-// Options: iterations, tolerance, quatNormalizeSkip, sleep, damping.
+// Options: iterations, tolerance, quatNormalizeSkip, sleep, damping, frequency (of contacts, in 1/dt).
 export async function build(C, scene, options) {
   const vec = (v) => new C.Vec3(...v), material = new C.Material(), moving = scene.bodies.filter((b) => b.mass > 0);
   const world = new C.World({ gravity: vec(scene.gravity) });
   if ("iterations" in options) Object.assign(world.solver, { iterations: options.iterations, tolerance: options.tolerance });
   if ("quatNormalizeSkip" in options) world.quatNormalizeSkip = options.quatNormalizeSkip;
   const values = { friction: scene.friction, restitution: scene.restitution ?? 0 };
+  if ("frequency" in options) { // the stiffness that gives the heaviest body this frequency, at least the shipped one
+    const heaviest = Math.max(...moving.map((b) => b.mass)), stiffness = heaviest * (2 * Math.PI * options.frequency / options.dt) ** 2;
+    values.contactEquationStiffness = values.frictionEquationStiffness = Math.max(1e7, stiffness);
+  }
   world.addContactMaterial(new C.ContactMaterial(material, material, values));
   const free = "damping" in options ? { linearDamping: options.damping, angularDamping: options.damping } : {};
   const ground = new C.Body({ mass: 0, material });

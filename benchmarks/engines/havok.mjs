@@ -1,5 +1,5 @@
 // Havok (@babylonjs/havok); a hinge is a constraint with five locked axes, a belt a kinematic body.
-// Options: idealStep (s; as shipped 1/60), sleep, damping.
+// Options: idealStep (s, or "dt": the time step; as shipped 1/60), sleep, damping.
 import { readFileSync } from "node:fs";
 let H = null; // one instance for all scenes
 const NONE = [0, 0, 0, 1];
@@ -11,7 +11,7 @@ export async function build(module, scene, options) {
   const value = ([result, made]) => made;
   const world = value(H.HP_World_Create()), moving = scene.bodies.filter((b) => b.mass > 0);
   H.HP_World_SetGravity(world, scene.gravity);
-  if ("idealStep" in options) H.HP_World_SetIdealStepTime(world, options.idealStep);
+  if ("idealStep" in options) H.HP_World_SetIdealStepTime(world, options.idealStep === "dt" ? options.dt : options.idealStep);
   const most = H.MaterialCombine.MAXIMUM;
   const add = (shape, position, b) => {
     const body = value(H.HP_Body_Create()), kinds = H.MotionType;

@@ -1,5 +1,6 @@
 // Jolt (jolt-physics): planes, boxes and spheres of its own; a hinge is a hinge constraint, a belt a kinematic body.
-// Options: sweeps, positions (steps of the position solver), substeps, sleep, damping, gyroscopic, slop, bounceSpeed.
+// Options: sweeps, positions (steps of the position solver), substeps, sleep, damping, gyroscopic, slop,
+// radius (of edges, m), bounceSpeed, cache (of contacts).
 const STILL = 0; // object layers: static bodies, and moving bodies
 const MOVING = 1;
 let J = null; // one instance for all scenes
@@ -18,13 +19,13 @@ export async function build(module, scene, options) {
   const all = new J.JoltInterface(settings), system = all.GetPhysicsSystem(), bodies = system.GetBodyInterface();
   system.SetGravity(vec(scene.gravity));
   const physics = system.GetPhysicsSettings();
-  const names = { sweeps: "mNumVelocitySteps", positions: "mNumPositionSteps", slop: "mPenetrationSlop", bounceSpeed: "mMinVelocityForRestitution" };
+  const names = { sweeps: "mNumVelocitySteps", positions: "mNumPositionSteps", slop: "mPenetrationSlop", bounceSpeed: "mMinVelocityForRestitution", cache: "mUseBodyPairContactCache" };
   for (const [key, name] of Object.entries(names)) if (key in options) physics[name] = options[key];
   system.SetPhysicsSettings(physics);
   const shapes = {
     plane: (s) => new J.PlaneShape(new J.Plane(vec(s.normal), -s.offset)),
     sphere: (s) => new J.SphereShape(s.radius),
-    box: (s) => new J.BoxShape(vec(s.size.map((x) => 0.5 * x)), Math.min(0.05, 0.5 * Math.min(...s.size))),
+    box: (s) => new J.BoxShape(vec(s.size.map((x) => 0.5 * x)), options.radius ?? Math.min(0.05, 0.5 * Math.min(...s.size))),
   };
   const make = (b) => {
     const still = b.mass === 0, [w, x, y, z] = b.quaternion;

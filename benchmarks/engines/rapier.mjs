@@ -1,5 +1,5 @@
 // Rapier (@dimforge/rapier3d-compat): half-spaces; a hinge is a revolute joint, a belt a kinematic body.
-// Options: iterations, sleep, allowedError, frequency (of contacts, in 1/dt).
+// Options: iterations (substeps), inner (iterations of each), sleep, allowedError, frequency (of contacts, in 1/dt).
 const xyz = ([x, y, z]) => ({ x, y, z });
 const turn = ([w, x, y, z]) => ({ w, x, y, z });
 const minus = (a, b) => xyz(a.map((x, i) => x - b[i]));
@@ -10,6 +10,7 @@ export async function build(module, scene, options) {
   const world = new R.World(xyz(scene.gravity));
   world.timestep = options.dt;
   if (options.iterations) world.numSolverIterations = options.iterations;
+  if (options.inner) world.integrationParameters.numInternalPgsIterations = options.inner;
   if (options.allowedError) world.integrationParameters.normalizedAllowedLinearError = options.allowedError;
   if (options.frequency) world.integrationParameters.contact_natural_frequency = options.frequency / options.dt;
   const ground = world.createRigidBody(R.RigidBodyDesc.fixed());

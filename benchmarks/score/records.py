@@ -31,6 +31,7 @@ class Record:
     residual: float  # m/s, largest of the steps that were read; nan if the engine cannot be read
     note: str = ""
     curve: str = ""  # JSON list of the values of a curve
+    settings: str = ""  # identifies the options of the engine, see `run.get_settings_key`
 
     @property
     def key(self) -> tuple[str, str, int, str]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -24,17 +25,27 @@ from benchmarks.score.simulate import (
     split_requirement,
 )
 from lavender._version import __version__
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError, LavenderError, UnknownName
 from lavender.cli.options import ListType
 
-LEVELS = ("default", "accurate")
-STEP_RATES = (240, 1000)
+#: Columns of the scorecard: settings and steps a second. From one to the next, one of the two changes.
+COLUMNS = (("default", 240), ("accurate", 240), ("accurate", 1000))
+LEVELS = tuple(dict.fromkeys(level for level, _ in COLUMNS))
+STEP_RATES = tuple(dict.fromkeys(rate for _, rate in COLUMNS))
+LIMIT = 10.0  # s of CPU time for a cell
+CURVE_FACTOR = 4  # Scenes with many simulations have this multiple of the limit.
 CLASSES = ("good", "fair", "poor", "wrong")
 
 
 def get_settings(entry: Entry, level: str) -> dict[str, object]:
     """Return the options of an engine in a column."""
     return {**entry.common, **(entry.accurate if level == "accurate" else {})}
+
+
+def get_settings_key(entry: Entry, level: str) -> str:
+    """Return eight digits that identify the options of an engine in a column."""
+    text = json.dumps(get_settings(entry, level), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def get_version(entry: Entry) -> str:
@@ -72,12 +83,20 @@ def measure_cell(
 def run_cells(
     name: str, cells: list[tuple[str, int, str]], envs: Path, runs: int, limit: float
 ) -> Iterator[Record]:
-    """Yield the record of each cell (column, rate, scene) of an engine."""
+    """Yield the record of each cell (column, rate, scene) of an engine.
+
+    The note of a cell that failed begins with "failed"; so do those of all cells if the engine does not install.
+    """
     entry = ENGINES[name]
-    command = find_program(name, entry, envs)
+    command = find_program(entry, envs)
     if command is None:
-        create_environment(name, entry, envs)
-        command = find_program(name, entry, envs)
+        try:
+            create_environment(entry, envs)
+        except LavenderError as error:
+            for cell in cells:
+                yield make_record(name, cell, runs, note=f"failed: {error}")
+            return
+        command = find_program(entry, envs)
         assert command is not None
     simulator = Simulator(command, {}, limit)
     try:
@@ -85,29 +104,67 @@ def run_cells(
             curve = SCENES[scene].curve
             simulator.settings = get_settings(entry, level)
             simulator.residuals = not curve
-            simulator.limit = limit * (4 if curve else 1)
+            simulator.limit = get_limit(entry, scene, limit)
             errors, costs, residual, note, values = measure_cell(simulator, scene, rate, runs)
             if entry.fresh:
                 simulator.close()
-            spread = max(errors) - min(errors) if all(map(math.isfinite, errors)) else math.nan
-            version = get_version(entry)
-            yield Record(
-                name,
-                version,
-                level,
-                rate,
-                scene,
-                runs,
-                errors[0],
-                spread,
-                min(costs),
-                max(costs),
-                residual,
-                note[:200].replace("\n", " "),
-                values,
+            yield make_record(
+                name, (level, rate, scene), runs, errors, costs, residual, note, values
             )
     finally:
         simulator.close()
+
+
+def get_limit(entry: Entry, scene: str, limit: float) -> float:
+    """Return the CPU time [s] of a cell of an engine."""
+    return limit * entry.patience * (CURVE_FACTOR if SCENES[scene].curve else 1)
+
+
+def make_record(
+    name: str,
+    cell: tuple[str, int, str],
+    runs: int,
+    errors: Sequence[float] = (math.nan,),
+    costs: Sequence[float] = (math.nan,),
+    residual: float = math.nan,
+    note: str = "",
+    curve: str = "",
+) -> Record:
+    """Return the record of the runs of a cell (column, rate, scene)."""
+    spread = max(errors) - min(errors) if all(map(math.isfinite, errors)) else math.nan
+    entry = ENGINES[name]
+    return Record(
+        name,
+        get_version(entry),
+        *cell,
+        runs,
+        errors[0],
+        spread,
+        min(costs),
+        max(costs),
+        residual,
+        note[:200].replace("\n", " "),
+        curve,
+        get_settings_key(entry, cell[0]),
+    )
+
+
+def needs_run(row: Record | None, repeat: int) -> bool:
+    """Return whether a cell is missing, or its record is of other settings, another version or fewer runs."""
+    if row is None or row.runs < repeat:
+        return True
+    entry = ENGINES[row.engine]
+    return (row.version, row.settings) != (get_version(entry), get_settings_key(entry, row.level))
+
+
+def add_record(rows: dict[tuple[str, str, int, str], Record], row: Record) -> bool:
+    """Add a record unless the cell failed, or was too slow and has an error of the same settings; return whether."""
+    old = rows.get(row.key)
+    measured = old is not None and not old.note and old.settings == row.settings
+    if row.note.startswith("failed") or (row.note.startswith("too slow") and measured):
+        return False
+    rows[row.key] = row
+    return True
 
 
 def make_table(rows: dict[tuple[str, str, int, str], Record], level: str, rate: int) -> str:
@@ -140,9 +197,9 @@ def make_table(rows: dict[tuple[str, str, int, str], Record], level: str, rate: 
 @click.option(
     "--limit",
     type=click.FloatRange(0.1),
-    default=10.0,
+    default=LIMIT,
     show_default=True,
-    help="CPU time of a cell [s].",
+    help="CPU time of a cell [s]; scenes with many simulations and slow engines have a multiple.",
 )
 @click.option("--again", is_flag=True, help="Run cells that the table has.")
 @click.option(
@@ -181,20 +238,22 @@ def command(
                 raise UnknownName(kind, name, known)
     if not set(rate) <= set(STEP_RATES):
         raise InputError(f"--rate: {rate}; 240 and 1000 are possible")
+    columns = [column for column in COLUMNS if column[0] in level and column[1] in rate]
     rows = read_records(out)
+    failures = 0
     with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(envs or temporary).resolve()
         for name in engine or ENGINES:
             cells = [
-                cell
-                for cell in product(level, rate, scene or SCENES)
-                if (again or (old := rows.get((name, *cell))) is None or old.runs < repeat)
-                and (cell[1] == 240 or not SCENES[cell[2]].curve)
+                (*column, key)
+                for column, key in product(columns, scene or SCENES)
+                if again or needs_run(rows.get((name, *column, key)), repeat)
+                if column[1] == STEP_RATES[0] or not SCENES[key].own_rates
             ]
-            for row in (
-                run_cells(name, cells, envs or Path(temporary), repeat, limit) if cells else ()
-            ):
-                rows[row.key] = row
-                write_records(rows.values(), out)
+            for row in run_cells(name, cells, folder, repeat, limit) if cells else ():
+                if add_record(rows, row):
+                    write_records(rows.values(), out)
+                failures += row.note.startswith("failed")
                 text = (
                     row.note
                     or f"{row.error:.3g} {SCENES[row.scene].unit}, {row.cost:.0f} µs a step"
@@ -203,5 +262,9 @@ def command(
                     f"{name} {row.version}, {row.level}, 1/{row.rate} s, {row.scene}: {text}",
                     err=True,
                 )
-    for column, steps in product(level, rate):
+    for column, steps in columns:
         click.echo(f"\n{column} settings, 1/{steps} s\n\n{make_table(rows, column, steps)}")
+    if failures:
+        raise click.ClickException(
+            f"{failures} of the cells failed; the table keeps what it had of them"
+        )

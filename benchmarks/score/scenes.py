@@ -23,6 +23,10 @@ HEADINGS = tuple(7.5 * k for k in range(7))  # degrees
 RATES = (240, 500, 1000, 2000, 4000)  # steps a second
 SAMPLE = 0.05  # s between two states that are read
 RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
+#: Way [m] and turn [rad] of the cube of `measure_spin` for all normal forces that its corners can have. The test
+#: integrates them: 1.160 to 1.194 m, 1.144 to 1.473 rad.
+SPIN_WAY = (1.155, 1.2)
+SPIN_TURN = (1.14, 1.48)
 Description = dict[str, Any]
 #: Simulates a description for its time and returns the times (k,) [s] and states (k, n, 13) of the moving bodies:
 #: position [m], quaternion w x y z, velocity [m/s], angular velocity [rad/s], in world axes. The arguments are the
@@ -146,6 +150,29 @@ def measure_slide(run: Run, dt: float) -> float:
     _, x = run(scene, dt, SAMPLE)
     truth = 9.0 / (2 * FRICTION * GRAVITY) * DIRECTION
     return float(np.linalg.norm(x[-1, 0, :2] - truth[:2]))
+
+
+def measure_spin(run: Run, dt: float) -> float:
+    """Return the error [m] at a corner of where a cube stops that starts with 3 m/s and 5 rad/s.
+
+    Coulomb's law at the four corners and the balance of moments leave one of the four normal forces undetermined, so
+    that truth is a range (`SPIN_WAY`, `SPIN_TURN`); the error is that outside of it: of the way, or of the turn times
+    the distance of a corner from the middle.
+    """
+    cube = make_body((1, 1, 1), 1.0, (0, 0, 0.5), velocity=3.0 * DIRECTION, spin=(0, 0, 5))
+    _, x = run(describe("spin", 2.0, [cube], planar=False), dt, SAMPLE)
+    q = x[:, 0, 3:7]
+    yaw = np.unwrap(2.0 * np.arctan2(q[:, 3], q[:, 0]), period=2.0 * math.pi)
+    way = float(np.linalg.norm((x[-1] - x[0])[0, :2]))
+    turn = float(yaw[-1] - yaw[0])
+    return max(
+        _get_distance_outside(way, SPIN_WAY),
+        math.sqrt(0.5) * _get_distance_outside(turn, SPIN_TURN),
+    )
+
+
+def _get_distance_outside(value: float, interval: tuple[float, float]) -> float:
+    return max(interval[0] - value, value - interval[1], 0.0) if math.isfinite(value) else math.inf
 
 
 def measure_roll(run: Run, dt: float) -> float:
@@ -339,7 +366,10 @@ class Scene:
     truth: str
     reason: str  # of the limits
     floor: Callable[[float], float] = lambda dt: 0.0  # error of the integrator alone at a time step
-    curve: bool = False  # whether it is measured at one rate only
+    curve: bool = False  # whether it has many simulations
+    own_rates: bool = (
+        False  # whether it has rates of its own, so that it is measured in one column of each level
+    )
 
 
 def _get_pendulum_floor(dt: float) -> float:
@@ -376,6 +406,14 @@ SCENES: Mapping[str, Scene] = {
         (1e-2, 3e-2, 1e-1),
         "stops after v²/(2 μ g) = 0.917 m, straight",
         "1 %, 3 % and 10 % of the way",
+        lambda dt: 1.5 * dt,
+    ),
+    "spin": Scene(
+        measure_spin,
+        "m",
+        (2e-2, 6e-2, 2e-1),
+        "a cube at 3 m/s and 5 rad/s stops after 1.16 to 1.2 m, 1.14 to 1.48 rad",
+        "2 %, 5 % and 17 % of the way",
         lambda dt: 1.5 * dt,
     ),
     "roll": Scene(
@@ -460,6 +498,7 @@ SCENES: Mapping[str, Scene] = {
         "first rebound e² h = 0.64 m, 240 to 4000 steps a second",
         "as bounce",
         curve=True,
+        own_rates=True,
     ),
     "ratios": Scene(
         measure_ratios,

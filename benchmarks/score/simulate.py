@@ -36,18 +36,18 @@ def split_requirement(requirement: str) -> tuple[str, str]:
     return (name, version) if name else (requirement, "")
 
 
-def find_program(name: str, entry: Entry, folder: Path) -> list[str] | None:
+def find_program(entry: Entry, folder: Path) -> list[str] | None:
     """Return the command that starts an engine's worker, None if its environment does not exist.
 
     The interpreter of this process is used if it has the pinned packages.
     """
     if entry.node:
-        package = folder / name / "node_modules" / split_requirement(entry.packages[0])[0]
+        package = folder / entry.engine / "node_modules" / split_requirement(entry.packages[0])[0]
         return ["node", str(SCRIPT), entry.adapter, str(package)] if package.is_dir() else None
     pinned = dict(map(split_requirement, entry.packages))
     if all(is_installed(package, version) for package, version in pinned.items()):
         return [sys.executable, "-m", "benchmarks.score.worker", entry.adapter]
-    interpreter = folder / name / "bin" / "python"
+    interpreter = folder / entry.engine / "bin" / "python"
     return (
         [str(interpreter), "-m", "benchmarks.score.worker", entry.adapter]
         if interpreter.exists()
@@ -63,9 +63,9 @@ def is_installed(package: str, version: str) -> bool:
         return False
 
 
-def create_environment(name: str, entry: Entry, folder: Path) -> None:
-    """Install the packages of an engine into `folder`/`name`."""
-    where = folder / name
+def create_environment(entry: Entry, folder: Path) -> None:
+    """Install the packages of an engine into a subfolder of its name."""
+    where = folder / entry.engine
     where.mkdir(parents=True, exist_ok=True)
     if entry.node:
         install = [
@@ -91,7 +91,7 @@ def create_environment(name: str, entry: Entry, folder: Path) -> None:
     done = subprocess.run(install, capture_output=True, text=True, check=False)
     if done.returncode:
         raise LavenderError(
-            f"{name} does not install: {(done.stderr or done.stdout).strip()[-300:]}"
+            f"{entry.engine} does not install: {(done.stderr or done.stdout).strip()[-300:]}"
         )
 
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from benchmarks.score import scenes
 from benchmarks.score.records import read_records
 from benchmarks.score.run import command, measure_cell, run_cells
-from benchmarks.score.settings import ENGINES
+from benchmarks.score.settings import ENGINES, RULE
 
 ROOT = Path(__file__).resolve().parents[2]
 DT = 1 / 240
@@ -203,6 +203,16 @@ def test_score_runs_only_cells_that_the_table_lacks(tmp_path):
         ("slip", 1),
         ("stick", 2),
     ]
+
+
+def test_score_settings_say_for_each_kind_of_knob_what_is_set_or_why_not():
+    packages = {}
+    for name, entry in ENGINES.items():
+        kinds = [knob.kind for knob in entry.knobs]
+        assert sorted([*kinds, *entry.unset]) == sorted(RULE), name
+        assert all(knob.options and knob.source for knob in entry.knobs), name
+        assert sum(len(knob.options) for knob in entry.knobs) == len(entry.accurate), name
+        assert packages.setdefault(entry.engine, entry.packages) == entry.packages, name
 
 
 def test_score_table_of_the_repository_has_the_pinned_versions():

@@ -12,7 +12,10 @@ from benchmarks.score import adapters as tools
 
 
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
-    """Use `World.step`; options are `substeps`, `sleep` and `bounce_speed`."""
+    """Use `World.step`.
+
+    Options are `substeps`, `sleep`, `bounce_speed` [m/s], `recycle` [m], `contact_hertz` and `joint_hertz`.
+    """
     steps = options.get("substeps", 4)
     sleep = options.get("sleep", True)
     world = robox3d.World(scene["gravity"], substeps=steps, enable_sleep=sleep)
@@ -20,6 +23,12 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     bodies = []
     if "bounce_speed" in options:
         lib.b3World_SetRestitutionThreshold(world.id, options["bounce_speed"])
+    if "recycle" in options:
+        lib.b3World_SetContactRecycleDistance(world.id, options["recycle"])
+    if (
+        "contact_hertz" in options
+    ):  # Damping ratio 10 and push speed 3 m/s are those that Box3D ships.
+        lib.b3World_SetContactTuning(world.id, options["contact_hertz"], 10.0, 3.0)
     material = {"friction": scene["friction"], "restitution": scene["restitution"]}
     ground = world.create_body((0, 0, -1), kind="static")
     if tools.has_ground(scene):
@@ -37,7 +46,7 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     for joint in scene["joints"]:
         first = bodies[joint["a"]] if joint["a"] >= 0 else ground
         motor = joint["motor"][::-1] if joint["motor"] else None
-        how = {"motor": motor, "constraint_hertz": None}
+        how = {"motor": motor, "constraint_hertz": options.get("joint_hertz")}
         world.create_revolute_joint(
             first, bodies[joint["b"]], joint["anchor"], joint["axis"], **how
         )

@@ -11,11 +11,21 @@ import pybullet as p
 
 from benchmarks.score import adapters as tools
 
+#: Options that are arguments of changeDynamics.
+OF_BODIES = (
+    "collisionMargin",
+    "activationState",
+    "linearDamping",
+    "angularDamping",
+    "jointDamping",
+)
+
 
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
-    """Use `stepSimulation`; options are those of setPhysicsEngineParameter, and `free`: no damping, no sleep."""
+    """Use `stepSimulation`; options are those of setPhysicsEngineParameter and of changeDynamics."""
     p.connect(p.DIRECT)
-    settings = {key: value for key, value in options.items() if key not in ("dt", "free")}
+    settings = {key: value for key, value in options.items() if key not in ("dt", *OF_BODIES)}
+    changes = {key: value for key, value in options.items() if key in OF_BODIES}
     p.setPhysicsEngineParameter(fixedTimeStep=options["dt"], **settings)
     p.setGravity(*scene["gravity"])
     grounds = (
@@ -80,10 +90,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         p.changeDynamics(
             *part, lateralFriction=scene["friction"] ** 0.5, restitution=scene["restitution"] ** 0.5
         )
-        if "free" in options:
-            p.changeDynamics(
-                *part, linearDamping=0, angularDamping=0, jointDamping=0, activationState=2
-            )
+        if changes:
+            p.changeDynamics(*part, **changes)
 
     def step() -> None:
         for i, b in enumerate(moving):

@@ -11,7 +11,7 @@ from benchmarks.score import adapters as tools
 
 
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
-    """Use `World.step`; options are `solver`, the name of a class, `detector`, and `split` impulses."""
+    """Use `World.step`; options are `detector`, `split` impulses, `solver`, a class, and those of the class."""
     world = dart.simulation.World()
     moving = tools.get_moving(scene)
     links = {k.body: k for k in tools.make_tree(scene)}
@@ -25,7 +25,14 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     if "split" in options:
         solver.setSplitImpulseEnabled(True)
     if "solver" in options:
-        solver.setBoxedLcpSolver(getattr(dart.constraint, options["solver"])())
+        method = getattr(dart.constraint, options["solver"])()
+        more = {k: v for k, v in options.items() if k not in ("dt", "detector", "split", "solver")}
+        if more:
+            values = method.getOptions()
+            for key, value in more.items():
+                setattr(values, key, value)
+            method.setOptions(values)
+        solver.setBoxedLcpSolver(method)
 
     def add_shape(node: Any, half: Any, radius: float) -> None:
         shape = (

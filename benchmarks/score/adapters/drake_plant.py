@@ -15,6 +15,8 @@ import pydrake.all as drake  # noqa: E402
 
 logging.getLogger("drake").setLevel(logging.ERROR)
 
+SHIPPED_MODULUS = 1e7  # Pa; hydroelastic_modulus of DefaultProximityProperties
+
 
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     """Use `AdvanceTo`; options are `approximation`, `stiction` [m/s] and `hydroelastic`, a mesh resolution."""
@@ -22,8 +24,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         raise tools.CannotExpress(
             "no restitution coefficient, only dissipation or a relaxation time"
         )
-    if len(tools.make_tree(scene)) < len(scene["joints"]):
-        raise tools.CannotExpress("the adapter closes no loops")
+    if len(tools.make_tree(scene)) < len(scene["joints"]) and "approximation" not in options:
+        raise tools.CannotExpress("TAMSI, the shipped solver, has no constraints that close loops")
     moving = tools.get_moving(scene)
     links = {link.body: link for link in tools.make_tree(scene)}
     builder = drake.DiagramBuilder()
@@ -35,6 +37,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         )
     if "stiction" in options:
         plant.set_stiction_tolerance(options["stiction"])
+    if "penetration" in options:
+        plant.set_penetration_allowance(options["penetration"])
 
     def add_shape(body: Any, shape: Any, name: str, size: float, rigid: bool) -> None:
         made = drake.ProximityProperties()
@@ -45,7 +49,9 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         if fine and rigid:
             drake.AddRigidHydroelasticProperties(size, made)
         elif fine:
-            drake.AddCompliantHydroelasticProperties(size * fine, 1e8, made)
+            drake.AddCompliantHydroelasticProperties(
+                size * fine, options.get("modulus", SHIPPED_MODULUS), made
+            )
         plant.RegisterCollisionGeometry(body, drake.RigidTransform(), shape, name, made)
 
     def add_frame(name: str, body: Any, offset: Any) -> Any:
@@ -77,6 +83,13 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
             ):  # The torque falls below its limit within 1 % of the speed.
                 gains = drake.PdControllerGains(p=1e-9, d=100 * link.drive[1] / link.drive[0])
                 plant.AddJointActuator(f"m{i}", joint, link.drive[1]).set_controller_gains(gains)
+        for point in link.loops if link else ():
+            plant.AddBallConstraint(
+                bodies[i],
+                np.subtract(point, b["position"]),
+                plant.world_body(),
+                np.array(point, float),
+            )
     plant.Finalize()
     simulator = drake.Simulator(builder.Build())
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())

@@ -34,7 +34,7 @@ def make_contact(scene: dict[str, Any], dt: float, hard: bool) -> str:
 
 
 def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bool = False) -> str:
-    """Return the MJCF of a scene; `options` are attributes of `<option>`."""
+    """Return the MJCF of a scene; `options` are attributes of `<option>`, `hard` is stiff contacts and loops."""
     loops = motors = ""
     moving = get_moving(scene)
     world = ""
@@ -72,10 +72,12 @@ def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bo
         else:
             world = body + world
     ground = '<geom type="plane" size="0 0 1"/>' if has_ground(scene) else ""
+    stiff = f'solref="{2 * dt!r} 1" solimp="0.99 0.9999 0.001"' if hard else ""
     attributes = " ".join(f'{key}="{value}"' for key, value in options.items())
     return (
         f'<mujoco><option timestep="{dt!r}" gravity="{join(scene["gravity"])}" {attributes}/>'
-        f"<default><geom {make_contact(scene, dt, hard)}/></default><worldbody>{ground}{world}</worldbody>"
+        f"<default><geom {make_contact(scene, dt, hard)}/><equality {stiff}/></default>"
+        f"<worldbody>{ground}{world}</worldbody>"
         f"<equality>{loops}</equality><actuator>{motors}</actuator></mujoco>"
     )
 
