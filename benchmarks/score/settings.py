@@ -17,7 +17,8 @@ Options = Mapping[str, Any]
 #: What the accurate columns do with each kind of knob, in every engine alike.
 RULE: Mapping[str, str] = {
     "iterations": "every count is 500, or the largest that is accepted; tolerances that end them are 0, or 1e-12. "
-    "Engines whose step on a CPU takes milliseconds because they are made for GPUs: 50",
+    "Engines whose step on a CPU takes milliseconds because they are made for GPUs: "
+    "50, or the shipped number if it is larger",
     "substeps": "as shipped, unless the solver makes one iteration in each: then 32, "
     "and a second row keeps the shipped number",
     "stiffness": "contacts and joints are as stiff as the documentation allows at the time step; "
@@ -258,6 +259,36 @@ def _make_rapier(title: str, common: Options, substeps: int) -> Entry:
         unset,
         common,
         node=True,
+    )
+
+
+_NEWTON = (
+    "newton==1.8.0",
+    "warp-lang==1.19.0",
+    "mujoco==3.17.0",
+    "mujoco-warp==3.17.0",
+    "scipy",
+)
+
+
+def _make_newton(
+    title: str,
+    solver: str,
+    knobs: tuple[Knob, ...],
+    unset: Mapping[str, str],
+    packages: tuple[str, ...] = _NEWTON,
+) -> Entry:
+    """Return a row of newton."""
+    shared = {
+        "substeps": NO_KNOB,
+        "margin": "no margin as shipped; no threshold of bounces",
+        "sleep": NO_KNOB,
+        "integration": NO_KNOB,
+        "damping": "0 as shipped",
+    }
+    shared = {kind: why for kind, why in shared.items() if kind not in [k.kind for k in knobs]}
+    return Entry(
+        title, "newton", "newton_warp", packages, knobs, shared | unset, {"solver": solver}
     )
 
 
@@ -532,4 +563,188 @@ ENGINES: Mapping[str, Entry] = {
             "integration": NO_KNOB,
         },
     ),
+    "p2": Entry(
+        "p2-es (2D)",
+        "p2",
+        "p2",
+        ("p2-es@1.2.3",),
+        (
+            Knob(
+                "iterations", {"iterations": 500, "tolerance": 0}, "GSSolver: iterations, tolerance"
+            ),
+            Knob(
+                "stiffness",
+                {"frequency": 0.125},
+                "ContactMaterial: stiffness, here from a frequency in 1/dt, and at least the shipped 1e6 N/m",
+            ),
+            Knob("damping", {"damping": 0}, "Body: damping, angularDamping"),
+        ),
+        {
+            "substeps": NO_KNOB,
+            "friction": "exact in the plane",
+            "slip": NO_KNOB,
+            "margin": NO_KNOB,
+            "sleep": "off as shipped",
+            "integration": NO_KNOB,
+        },
+        node=True,
+    ),
+    "oimo": Entry(
+        "oimo",
+        "oimo",
+        "oimo",
+        ("oimo@1.0.9",),
+        (
+            Knob("iterations", {"iterations": 500}, "World: iterations"),
+            Knob("sleep", {"sleep": False}, "World.add: neverSleep"),
+        ),
+        {
+            "substeps": NO_KNOB,
+            "stiffness": _RIGID,
+            "friction": "a round cone at each point as shipped",
+            "slip": NO_KNOB,
+            "margin": NO_KNOB,
+            "damping": "0 as shipped",
+            "integration": NO_KNOB,
+        },
+        node=True,
+    ),
+    "motrixsim": Entry(
+        "MotrixSim",
+        "motrixsim",
+        "motrix",
+        ("motrixsim==0.10.1", "numpy"),
+        (
+            Knob(
+                "iterations",
+                {"max_iterations": 500, "solver_tolerance": 1e-12},
+                "Options: max_iterations, solver_tolerance",
+            ),
+            Knob("stiffness", {"hard": True}, "MJCF as in MuJoCo: solref at least 2 dt, solimp"),
+        ),
+        {
+            "substeps": NO_KNOB,
+            "friction": NO_KNOB,
+            "slip": NO_KNOB,
+            "margin": "geoms have no margin and no rounding as shipped",
+            "sleep": NO_KNOB,
+            "damping": "0 as shipped",
+            "integration": NO_KNOB,
+        },
+    ),
+    "newton-xpbd": _make_newton(
+        "newton, XPBD",
+        "SolverXPBD",
+        (
+            Knob(
+                "iterations",
+                {"iterations": 50, "rigid_contact_restitution_iterations": 50},
+                "SolverXPBD: iterations, rigid_contact_restitution_iterations",
+            ),
+        ),
+        {
+            "stiffness": "no compliance as shipped",
+            "friction": "a round cone at each point as shipped",
+            "slip": NO_KNOB,
+        },
+    ),
+    "newton-vbd": _make_newton(
+        "newton, VBD",
+        "SolverVBD",
+        (
+            Knob("iterations", {"iterations": 50}, "SolverVBD: iterations"),
+            Knob("slip", {"friction_epsilon": 1e-5}, "SolverVBD: friction_epsilon"),
+        ),
+        {
+            "stiffness": "hard constraints by augmented Lagrangians as shipped",
+            "friction": "a round cone at each point as shipped",
+        },
+    ),
+    "newton-featherstone": _make_newton(
+        "newton, Featherstone",
+        "SolverFeatherstone",
+        (
+            Knob(
+                "stiffness",
+                {"frequency": 0.125},
+                "ShapeConfig: ke and kd, here from a frequency in 1/dt with critical damping",
+            ),
+            Knob("slip", {"friction_smoothing": 1e-5}, "SolverFeatherstone: friction_smoothing"),
+            Knob("damping", {"angular_damping": 0.0}, "SolverFeatherstone: angular_damping"),
+        ),
+        {
+            "iterations": "explicit forces of contacts",
+            "friction": "a round cone at each point as shipped",
+        },
+    ),
+    "newton-mujoco": _make_newton(
+        "newton, MuJoCo Warp",
+        "SolverMuJoCo",
+        (
+            Knob(
+                "iterations",
+                {"iterations": 100, "tolerance": 1e-12},
+                "SolverMuJoCo: iterations, tolerance",
+            ),
+            Knob("stiffness", {"hard": True}, "ShapeConfig: ke and kd, a solref of 2 dt"),
+            Knob("friction", {"cone": "elliptic"}, "SolverMuJoCo: cone"),
+            Knob("slip", {"impratio": 100.0}, "SolverMuJoCo: impratio"),
+            Knob("integration", {"integrator": "implicitfast"}, "SolverMuJoCo: integrator"),
+        ),
+        {},
+    ),
+    "mjx": Entry(
+        "MuJoCo MJX",
+        "mjx",
+        "mjx_jax",
+        ("mujoco-mjx==4.0.0", "mujoco==4.0.0", "scipy"),
+        (
+            Knob(
+                "iterations",
+                {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-12},
+                "MJX, Performance tuning: iterations and ls_iterations; tolerance as in MuJoCo",
+            ),
+            Knob("stiffness", {"hard": True}, "as MuJoCo"),
+            Knob("friction", {"cone": "elliptic"}, "as MuJoCo"),
+            Knob("slip", {"impratio": 100}, "as MuJoCo"),
+            Knob("integration", {"double": True}, "MJX: float64 by jax_enable_x64"),
+        ),
+        {
+            "substeps": NO_KNOB,
+            "margin": "geoms have no margin and no rounding as shipped; no threshold of bounces",
+            "sleep": "off as shipped",
+            "damping": "0 as shipped",
+        },
+    ),
+    "brax": Entry(
+        "brax, positional",
+        "brax",
+        "brax_jax",
+        ("brax==0.14.2",),
+        (),
+        {
+            "iterations": "one in each step",
+            "substeps": NO_KNOB,
+            "stiffness": "rigid contacts; scales of corrections stay as shipped",
+            "friction": "a round cone at each point as shipped",
+            "slip": NO_KNOB,
+            "margin": NO_KNOB,
+            "sleep": NO_KNOB,
+            "damping": "those of the scene, 0, as shipped",
+            "integration": NO_KNOB,
+        },
+        {"pipeline": "positional"},
+    ),
+}
+#: Engines that were tried and are not in the table, with the reason.
+NOT_RUN: Mapping[str, str] = {
+    "DART, PGS": "PgsBoxedLcpSolver has no constructor in Python",
+    "newton, Kamino": "a step takes 45 to 59 ms on a CPU: nearly all cells would be too slow",
+    "newton, SemiImplicit": "as Featherstone: explicit forces of contacts",
+    "Exudyn": "installed; contacts of boxes need meshes, no adapter yet",
+    "Simbody (opensim)": "installed; its contacts are of meshes and ellipsoids, no adapter yet",
+    "Chrono": "no package with the engine: pychrono is another project, projectchrono a reserved name",
+    "planck": "installed; a port of Box2D 2.4, which is in the table",
+    "matter-js": "an adapter was written: with true moments of inertia its pendulum explodes, "
+    "and neither motors nor belts can be expressed",
 }
