@@ -32,7 +32,7 @@ from lavender.cli.options import ListType
 COLUMNS = (("default", 240), ("accurate", 240), ("accurate", 1000))
 LEVELS = tuple(dict.fromkeys(level for level, _ in COLUMNS))
 STEP_RATES = tuple(dict.fromkeys(rate for _, rate in COLUMNS))
-LIMIT = 10.0  # s of CPU time for a cell
+LIMIT = 5.0  # s of CPU time for a cell
 CURVE_FACTOR = 4  # Scenes with many simulations have this multiple of the limit.
 CLASSES = ("good", "fair", "poor", "wrong")
 

@@ -589,6 +589,30 @@ ENGINES: Mapping[str, Entry] = {
         },
         node=True,
     ),
+    "planck": Entry(
+        "planck (2D)",
+        "planck",
+        "planck",
+        ("planck@1.5.0",),
+        (
+            Knob("iterations", {"velocity": 500, "position": 500}, "World.step: iterations"),
+            Knob(
+                "margin",
+                {"slop": 1e-5, "bounceSpeed": 0.01},
+                "Settings: linearSlop, whose double is the radius of polygons, velocityThreshold",
+            ),
+            Knob("sleep", {"sleep": False}, "WorldDef: allowSleep"),
+        ),
+        {
+            "substeps": "subStepping is for continuous collision",
+            "stiffness": _RIGID,
+            "friction": "exact in the plane",
+            "slip": NO_KNOB,
+            "damping": "0 as shipped",
+            "integration": NO_KNOB,
+        },
+        node=True,
+    ),
     "oimo": Entry(
         "oimo",
         "oimo",
@@ -608,6 +632,36 @@ ENGINES: Mapping[str, Entry] = {
             "integration": NO_KNOB,
         },
         node=True,
+    ),
+    "exudyn": Entry(
+        "Exudyn, no contacts",
+        "exudyn",
+        "exudyn_mbs",
+        ("exudyn==1.13.6", "numpy"),
+        (
+            Knob(
+                "iterations",
+                {
+                    "timeIntegration.newton.relativeTolerance": 1e-12,
+                    "timeIntegration.newton.absoluteTolerance": 1e-12,
+                },
+                "NewtonSettings: relativeTolerance, absoluteTolerance",
+            ),
+            Knob(
+                "damping",
+                {"timeIntegration.generalizedAlpha.spectralRadius": 1.0},
+                "GeneralizedAlphaSettings: 1 is no numerical damping",
+            ),
+        ),
+        {
+            "substeps": "as shipped",
+            "stiffness": "ideal joints",
+            "friction": "no contacts here",
+            "slip": "no contacts here",
+            "margin": "no contacts here",
+            "sleep": NO_KNOB,
+            "integration": "generalized alpha, of second order, as shipped",
+        },
     ),
     "motrixsim": Entry(
         "MotrixSim",
