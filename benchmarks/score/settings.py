@@ -321,9 +321,9 @@ ENGINES: Mapping[str, Entry] = {
             "integration": NO_KNOB,
         },
     ),
-    "mujoco": _make_mujoco("MuJoCo, Newton", {}),
+    "mujoco": _make_mujoco("MuJoCo (Newton)", {}),
     "mujoco-noslip": _make_mujoco(
-        "MuJoCo, noslip",
+        "MuJoCo (noslip)",
         {},
         slip=Knob(
             "slip",
@@ -331,9 +331,9 @@ ENGINES: Mapping[str, Entry] = {
             "Modeling, Solver settings: if that is not sufficient, noslip",
         ),
     ),
-    "mujoco-soft": _make_mujoco("MuJoCo, soft contacts", {}, stiffness=None),
+    "mujoco-soft": _make_mujoco("MuJoCo (soft contacts)", {}, stiffness=None),
     "mujoco-rk4": _make_mujoco(
-        "MuJoCo, RK4",
+        "MuJoCo (RK4)",
         {},
         integration=Knob(
             "integration",
@@ -341,7 +341,7 @@ ENGINES: Mapping[str, Entry] = {
             "Computation, Integrators: RK4 for motions that conserve energy",
         ),
     ),
-    "mujoco-pgs": _make_mujoco("MuJoCo, PGS", {"solver": "PGS"}),
+    "mujoco-pgs": _make_mujoco("MuJoCo (PGS)", {"solver": "PGS"}),
     "pybullet": Entry(
         "PyBullet",
         "pybullet",
@@ -379,10 +379,10 @@ ENGINES: Mapping[str, Entry] = {
             "integration": NO_KNOB,
         },
     ),
-    "dart": _make_dart("DART, Dantzig", {}, False),
-    "dart-nsgs": _make_dart("DART, NSGS", {"solver": "NsgsFrictionSolver"}, True),
-    "drake": _make_drake("Drake, point contact", {}),
-    "drake-hydro": _make_drake("Drake, hydroelastic", {"hydroelastic": 0.1}),
+    "dart": _make_dart("DART (Dantzig)", {}, False),
+    "dart-nsgs": _make_dart("DART (NSGS)", {"solver": "NsgsFrictionSolver"}, True),
+    "drake": _make_drake("Drake (point contact)", {}),
+    "drake-hydro": _make_drake("Drake (hydroelastic)", {"hydroelastic": 0.1}),
     "physx": Entry(
         "PhysX 5 (sapien)",
         "physx",
@@ -407,8 +407,8 @@ ENGINES: Mapping[str, Entry] = {
             "integration": "gyroscopic forces are not offered by sapien",
         },
     ),
-    "box3d": _make_box3d("Box3D (robox3d)", {}, 32),
-    "box3d-shipped": _make_box3d("Box3D, 4 substeps", {}, 0),
+    "box3d": _make_box3d("Box3D", {}, 32),
+    "box3d-shipped": _make_box3d("Box3D (4 substeps)", {}, 0),
     "jolt": Entry(
         "Jolt",
         "jolt",
@@ -447,7 +447,7 @@ ENGINES: Mapping[str, Entry] = {
         node=True,
     ),
     "rapier": _make_rapier("Rapier", {}, 32),
-    "rapier-shipped": _make_rapier("Rapier, 4 substeps", {}, 0),
+    "rapier-shipped": _make_rapier("Rapier (4 substeps)", {}, 0),
     "havok": Entry(
         "Havok",
         "havok",
@@ -634,7 +634,7 @@ ENGINES: Mapping[str, Entry] = {
         node=True,
     ),
     "exudyn": Entry(
-        "Exudyn, no contacts",
+        "Exudyn (no contacts)",
         "exudyn",
         "exudyn_mbs",
         ("exudyn==1.13.6", "numpy"),
@@ -687,7 +687,7 @@ ENGINES: Mapping[str, Entry] = {
         },
     ),
     "newton-xpbd": _make_newton(
-        "newton, XPBD",
+        "newton (XPBD)",
         "SolverXPBD",
         (
             Knob(
@@ -703,7 +703,7 @@ ENGINES: Mapping[str, Entry] = {
         },
     ),
     "newton-vbd": _make_newton(
-        "newton, VBD",
+        "newton (VBD)",
         "SolverVBD",
         (
             Knob("iterations", {"iterations": 50}, "SolverVBD: iterations"),
@@ -715,7 +715,7 @@ ENGINES: Mapping[str, Entry] = {
         },
     ),
     "newton-featherstone": _make_newton(
-        "newton, Featherstone",
+        "newton (Featherstone)",
         "SolverFeatherstone",
         (
             Knob(
@@ -732,7 +732,7 @@ ENGINES: Mapping[str, Entry] = {
         },
     ),
     "newton-mujoco": _make_newton(
-        "newton, MuJoCo Warp",
+        "newton (MuJoCo Warp)",
         "SolverMuJoCo",
         (
             Knob(
@@ -771,7 +771,7 @@ ENGINES: Mapping[str, Entry] = {
         },
     ),
     "brax": Entry(
-        "brax, positional",
+        "brax (positional)",
         "brax",
         "brax_jax",
         ("brax==0.14.2",),

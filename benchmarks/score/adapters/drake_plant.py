@@ -24,8 +24,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         raise tools.CannotExpress(
             "no restitution coefficient, only dissipation or a relaxation time"
         )
-    if len(tools.make_tree(scene)) < len(scene["joints"]) and "approximation" not in options:
-        raise tools.CannotExpress("TAMSI, the shipped solver, has no constraints that close loops")
+    if len(tools.make_tree(scene)) < len(scene["joints"]):
+        raise tools.CannotExpress("the adapter closes no loops")
     moving = tools.get_moving(scene)
     links = {link.body: link for link in tools.make_tree(scene)}
     builder = drake.DiagramBuilder()
@@ -83,13 +83,6 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
             ):  # The torque falls below its limit within 1 % of the speed.
                 gains = drake.PdControllerGains(p=1e-9, d=100 * link.drive[1] / link.drive[0])
                 plant.AddJointActuator(f"m{i}", joint, link.drive[1]).set_controller_gains(gains)
-        for point in link.loops if link else ():
-            plant.AddBallConstraint(
-                bodies[i],
-                np.subtract(point, b["position"]),
-                plant.world_body(),
-                np.array(point, float),
-            )
     plant.Finalize()
     simulator = drake.Simulator(builder.Build())
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())

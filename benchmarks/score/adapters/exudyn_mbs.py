@@ -60,7 +60,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         )
     system.Assemble()
     settings = exu.SimulationSettings()
-    settings.timeIntegration.numberOfSteps = round(scene["seconds"] / options["dt"]) + 1
+    # More steps than are made: the solver shortens those at its end.
+    settings.timeIntegration.numberOfSteps = 4 * round(scene["seconds"] / options["dt"])
     settings.timeIntegration.endTime = settings.timeIntegration.numberOfSteps * options["dt"]
     settings.timeIntegration.verboseMode = 0
     settings.solutionSettings.writeSolutionToFile = False
