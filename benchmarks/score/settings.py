@@ -638,22 +638,9 @@ ENGINES: Mapping[str, Entry] = {
         "exudyn",
         "exudyn_mbs",
         ("exudyn==1.13.6", "numpy"),
-        (
-            Knob(
-                "iterations",
-                {
-                    "timeIntegration.newton.relativeTolerance": 1e-12,
-                    "timeIntegration.newton.absoluteTolerance": 1e-12,
-                },
-                "NewtonSettings: relativeTolerance, absoluteTolerance",
-            ),
-            Knob(
-                "damping",
-                {"timeIntegration.generalizedAlpha.spectralRadius": 1.0},
-                "GeneralizedAlphaSettings: 1 is no numerical damping",
-            ),
-        ),
+        (),
         {
+            "iterations": "tolerances of 1e-12 are below rounding: some steps do not end",
             "substeps": "as shipped",
             "stiffness": "ideal joints",
             "friction": "no contacts here",
@@ -661,6 +648,7 @@ ENGINES: Mapping[str, Entry] = {
             "margin": "no contacts here",
             "sleep": NO_KNOB,
             "integration": "generalized alpha, of second order, as shipped",
+            "damping": "0 as shipped; without the integrator's own damping a step of tumble does not end",
         },
     ),
     "motrixsim": Entry(

@@ -255,7 +255,7 @@ def test_score_pages_have_the_tables_and_sentences_of_records_and_settings(drawi
         for name, part in parts.items():
             assert part in text, (page, name)
     assert {row.engine for row in rows.values()} == set(drawing.get_engines(rows))
-    assert len({ENGINES[name].engine for name in drawing.get_engines(rows)}) >= 12
+    assert len({ENGINES[name].engine for name in drawing.get_engines(rows)}) >= 19
 
 
 def test_score_page_outside_of_computed_parts_has_no_number_of_an_engine():
