@@ -173,8 +173,12 @@ class BuildKernels(build_ext):
         )
         gc.enable()
         for module, c_module in zip(self.extensions, translated, strict=True):
+            # Cython does not know which headers a header includes.
+            headers = sorted(map(str, Path(module.sources[0]).parent.glob("*.h")))
             module.sources = c_module.sources
-            module.depends = [path for path in c_module.depends if not is_part_of_cython(path)]
+            module.depends = [
+                path for path in c_module.depends if not is_part_of_cython(path)
+            ] + headers
         # Compile the largest modules first: a long one that starts last would delay the end of the build.
         self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers

@@ -56,6 +56,42 @@ def test_recorded_results_are_of_faults_and_name_a_test_file_that_exists():
     assert [name for name in sorted(files) if not (ROOT / name).is_file()] == []
 
 
+def test_recorded_tests_still_exist():
+    """The faults that a removed test found need another one: `.ci/mutants --changed COMMIT --record`."""
+    lost = []
+    for name, test in mutants.read_results().items():
+        if test.startswith("tests/"):
+            path, function = test.split("::")[:2]
+            if f"def {function.split('[')[0]}(" not in (ROOT / path).read_text(encoding="utf-8"):
+                lost.append(f"{name}: {test}")
+    assert lost == []
+
+
+def test_drawn_faults_are_also_those_of_a_tired_person_and_in_headers():
+    files = (
+        "lavender/solving/prepared.py",
+        "lavender/report/tables.py",
+        "lavender_ext/batch/many.pyx",
+        "lavender_ext/judge/reference.pxd",
+        "lavender_ext/batch/lanes_body.h",
+    )
+    drawn = [*mutants.draw_faults(ROOT, 200, 1, dict.fromkeys(files, set(range(10_000))))]
+    operators = {sentence.split(",")[0] for _, sentence, _, _ in drawn}
+    assert operators >= {
+        "like-named",
+        "stale value",
+        "wrong unit",
+        "wrong default",
+        "wrong door",
+        "sign",
+        "bound",
+    }
+    assert {path.rpartition(".")[2] for _, _, path, _ in drawn} == {"py", "pyx", "pxd", "h"}
+    for name, sentence, path, lines in drawn[::7]:
+        text = (ROOT / path).read_text(encoding="utf-8")
+        assert mutants.apply_fault(mutants.Fault(name, sentence, path, "", lines), text) != text
+
+
 def test_nearly_all_faults_of_kernels_can_be_switched():
     """Each other one costs a compilation of minutes."""
     kernels = [fault for fault in FAULTS if fault.is_kernel]
