@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
+from calls import over_velocities
 from hypothesis import given
 from random_problems import (
     FORMS,
@@ -139,3 +141,24 @@ def test_auto_with_stages_left_out_for_lack_of_time_ends_with_the_status_time_li
     assert solution.status is lv.Status.TIME_LIMIT and solution.stages[0].solver == "anderson"
     monkeypatch.undo()
     assert lv.solve(problem, "auto", tol=1e-6).success
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize(("rows", "velocities"), [(9, 12), (12, 9), (24, 18)])
+def test_more_islands_of_one_size_are_solved_by_the_same_method(law, rows, velocities):
+    """The rows of an island, not of all islands, decide what is too large for Newton's method."""
+    methods = []
+    for copies in (4, 12, 40):
+        parts = [over_velocities(rows, velocities, seed=s).generalized for s in range(copies)]
+        problem = lv.Problem.from_jacobian(
+            sp.block_diag([g.jac for g in parts]),
+            sp.block_diag([g.mass for g in parts]),
+            np.concatenate([g.v_free for g in parts]),
+            cones=lv.Cones.contacts(np.full(rows // 3 * copies, 0.5)),
+            compliance=0.02,
+            friction=law,
+        )
+        solution = lv.solve(problem)
+        assert solution.success
+        methods.append({stage.solver for stage in solution.stages})
+    assert methods[0] == methods[1] == methods[2]
