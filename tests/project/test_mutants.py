@@ -75,7 +75,7 @@ def test_drawn_faults_are_also_those_of_a_tired_person_and_in_headers():
         "lavender_ext/judge/reference.pxd",
         "lavender_ext/batch/lanes_body.h",
     )
-    drawn = [*mutants.draw_faults(ROOT, 200, 1, dict.fromkeys(files, set(range(10_000))))]
+    drawn = [*mutants.draw_faults(ROOT, 200, 1, {path: set(range(10_000)) for path in files})]
     operators = {sentence.split(",")[0] for _, sentence, _, _ in drawn}
     assert operators >= {
         "like-named",
