@@ -20,21 +20,19 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import subprocess
 import sys
 import tempfile
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+from benchmarks.pairs import ROOT, Answer, Checkout, build_base, serve
+
 TOL, RIGHT = 1e-6, 1e-5
 LIMIT = 5.0  # [s] Time limit of a solve.
 REPEATED_BELOW = 1.0  # [s] Calls that take longer run once.
@@ -46,8 +44,6 @@ ALONE = {
     "proxqp": {"eps_abs": 1e-8, "eps_rel": 1e-8},
 }
 BACKENDS = ("clarabel", "piqp", "daqp", "proxqp", "quadprog", "osqp", "highs")
-
-Answer = dict[str, Any]
 
 
 # -- in a process of either checkout ----------------------------------------------------------------
@@ -175,90 +171,21 @@ CALLS: dict[str, Callable[..., Answer]] = {
 }
 
 
-def serve() -> None:
-    """Answer lines of JSON [name, argument, ...] until the input ends."""
-    warnings.simplefilter("ignore")
-    out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # Backends print.
-    for line in sys.stdin:
-        name, *arguments = json.loads(line)
-        try:
-            answer = CALLS[name](*arguments)
-        except Exception as error:  # An answer too: what the call says.
-            answer = {"status": f"{type(error).__name__}: {error}"[:200], "seconds": float("nan")}
-        print(json.dumps(answer), file=out, flush=True)
-
-
-class Checkout:
-    """A process in a built checkout."""
-
-    def __init__(self, folder: Path) -> None:
-        code = (
-            f"import runpy; runpy.run_path({str(Path(__file__).resolve())!r}, run_name='__main__')"
-        )
-        environment = os.environ | {"PYTHONPATH": str(folder)}
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code],
-            cwd=folder,
-            env=environment,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        self.folder = folder
-
-    def ask(self, *call: Any) -> Answer:
-        """Return the answer of a call; of one that ends the process, its status."""
-        assert self.process.stdin is not None and self.process.stdout is not None
-        if self.process.poll() is None:
-            self.process.stdin.write(json.dumps(call) + "\n")
-            self.process.stdin.flush()
-        limit = None if call[0] == "step_models" else ANSWER_LIMIT
-        if not select.select([self.process.stdout], [], [], limit)[0]:
-            self.process.kill()
-        line = self.process.stdout.readline()
-        if line:
-            return dict(json.loads(line))
-        ended = f"process ended ({self.process.wait()})"
-        self.__init__(self.folder)  # type: ignore[misc]
-        return {"status": ended, "seconds": float("nan")}
-
-
 # -- in this process ---------------------------------------------------------------------------------
 
 
-@contextmanager
-def build_base(commit: str) -> Iterator[Path]:
-    """Check a commit out and compile its kernels; remove it in the end. A folder is a checkout that is built."""
-    if Path(commit).is_dir():
-        yield Path(commit).resolve()
-        return
-    with tempfile.TemporaryDirectory() as work:
-        folder = Path(work) / "base"
-        subprocess.run(
-            ["git", "worktree", "add", "-q", "--detach", folder, commit], cwd=ROOT, check=True
-        )
-        try:
-            command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
-            subprocess.run(
-                command,
-                cwd=folder,
-                check=True,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            yield folder
-        finally:
-            subprocess.run(["git", "worktree", "remove", "--force", folder], cwd=ROOT, check=False)
+def ask(side: Checkout, *call: Any) -> Answer:
+    """Return the answer of a checkout; a backend that answers later than ANSWER_LIMIT is ended."""
+    return side.ask(*call, limit=None if call[0] == "step_models" else ANSWER_LIMIT)
 
 
 def ask_both(sides: list[Checkout], *call: Any, out: list[str] | None = None) -> list[Answer]:
     """Return the answers of both checkouts, each with the smaller time of two alternating runs."""
     given = [(*call, path) for path in out] if out else [call, call]
-    answers = [side.ask(*own) for side, own in zip(sides, given, strict=True)]
+    answers = [ask(side, *own) for side, own in zip(sides, given, strict=True)]
     if max(a["seconds"] for a in answers) < REPEATED_BELOW:
         for side, own, answer in zip(sides, given, answers, strict=True):
-            answer["seconds"] = min(answer["seconds"], side.ask(*own)["seconds"])
+            answer["seconds"] = min(answer["seconds"], ask(side, *own)["seconds"])
     return answers
 
 
@@ -270,7 +197,7 @@ def compare_programs(sides: list[Checkout], folder: Path, backends: list[str]) -
             continue
         for solver in ("auto", *backends):
             call = str(path), optima[path.stem], solver
-            alone = None if solver == "auto" else sides[1].ask("solve_program_alone", *call)
+            alone = None if solver == "auto" else ask(sides[1], "solve_program_alone", *call)
             base, head = ask_both(sides, "solve_program", *call)
             yield {
                 "group": "programs",
@@ -425,7 +352,7 @@ def list_models(sides: list[Checkout]) -> Iterator[str]:
         yield "robot models: mujoco is not installed"
         return
     for name, side in zip(("base", "head"), sides, strict=True):
-        count = side.ask("step_models", str(ROOT / "tests"))
+        count = ask(side, "step_models", str(ROOT / "tests"))
         yield f"robot models, {name}: " + ", ".join(
             f"{key} {value}" for key, value in count.items()
         )
@@ -475,7 +402,7 @@ def make_command() -> Any:
             click.echo("recorded problems and FCLIB: LAVENDER_PROBLEMS does not name a folder")
         reports = ROOT / "tests/field/test_reports.py"
         with build_base(base) as folder, tempfile.TemporaryDirectory() as work:
-            sides = [Checkout(folder), Checkout(ROOT)]
+            sides = [Checkout(folder, __file__), Checkout(ROOT, __file__)]
             files = [
                 *(list_problems(problems) if problems else []),
                 *write_drawn_problems(drawn, Path(work)),
@@ -514,6 +441,6 @@ def make_command() -> Any:
 
 
 if __name__ == "__main__":
-    serve()
+    serve(CALLS)
 else:
     command = make_command()

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from time import process_time_ns
 from typing import Any
 
 import click
@@ -22,6 +21,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown, out_option, write_json
+from benchmarks.pairs import time_alternately
 from lavender.io import mujoco as reader
 from lavender.problem import Problem
 
@@ -51,13 +51,7 @@ def list_models(folders: tuple[Path, ...]) -> list[Path]:
 
 def measure_minimum(call: Callable[[], Any], prepare: Callable[[], Any], repeats: int) -> float:
     """Return the smallest CPU time [s] of a call; `prepare` is called before each one and is not timed."""
-    best = np.inf
-    for _ in range(repeats):
-        prepare()
-        begin = process_time_ns()
-        call()
-        best = min(best, process_time_ns() - begin)
-    return float(1e-9 * best)
+    return float(time_alternately(call, rounds=repeats, before=prepare).min())
 
 
 def collect_states(path: Path, mujoco: Any) -> Iterator[tuple[Any, Any, np.ndarray]]:

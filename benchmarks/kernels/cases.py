@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clock import least
 from benchmarks.core_problems import lattice_pile
 from benchmarks.kernels import microbenchmarks
 from benchmarks.kernels.problems import bare_contacts, raw_bytes, tridiagonal
+from benchmarks.pairs import time_for
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.residuals import residual
@@ -65,7 +65,7 @@ class Job:
     def row(self, seconds: float) -> Row:
         """Time the case for `seconds` and return its row."""
         both = [self.call] if self.limit is None else [self.call, self.limit]
-        time, *other = least(*both, seconds=seconds)
+        time, *other = time_for(seconds, *both)
         return Row(
             case=self.case,
             size=self.size,
@@ -227,7 +227,7 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
         ("16 sweeps", "contact and sweep", 16 * contacts, best["solve"] - best["warm"]),
         ("integrate, project", "body", bodies, best["finish"]),
     )
-    step = least(simulation.step, seconds=seconds)[0]
+    step = time_for(seconds, simulation.step)[0]
     return [
         *(
             Row(f"engine: {name}", size, unit, work, max(time, 1e-9))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import corpus
+from benchmarks import corpus, pairs
 
 PROGRAMS = Path(__file__).parents[1] / "field" / "programs"
 OPTIMA = json.loads((PROGRAMS / "objectives.json").read_text())
@@ -34,7 +34,7 @@ def test_right_is_the_optimum_within_its_rows_and_nothing_else():
 
 
 def test_two_checkouts_answer_alike_and_survive_an_error(tmp_path):
-    sides = [corpus.Checkout(corpus.ROOT), corpus.Checkout(corpus.ROOT)]
+    sides = [corpus.Checkout(corpus.ROOT, corpus.__file__) for _ in range(2)]
     [group] = {
         group for group, _ in corpus.write_drawn_problems(1, tmp_path) if group == "drawn: suite"
     }
@@ -53,3 +53,38 @@ def test_two_checkouts_answer_alike_and_survive_an_error(tmp_path):
     for side in sides:
         side.process.communicate()
         assert side.process.returncode == 0
+
+
+def test_pairs_compare_a_statement_of_two_checkouts_and_report_an_error():
+    sides = [pairs.Checkout(pairs.ROOT), pairs.Checkout(pairs.ROOT)]
+    setup = "import lavender as lv; p = lv.suite.case('stack(n=4)').problem"
+    cells = pairs.compare_statement(sides, 0, setup, "lv.solve(p)")
+    base, head, ratio = map(float, cells[:3])
+    assert base > 0.0 and head > 0.0 and ratio > 0.0
+    assert pairs.compare_statement(sides, 1, setup, "q") == [
+        "",
+        "",
+        "",
+        "NameError: name 'q' is not defined",
+    ]
+    for side in sides:
+        side.process.communicate()
+        assert side.process.returncode == 0
+
+
+def test_pairs_time_functions_in_turn_and_count_only_the_call():
+    done = []
+    times = pairs.time_alternately(
+        lambda: done.append("a"),
+        lambda: done.append("b"),
+        rounds=3,
+        before=lambda: done.append("-"),
+    )
+    assert times.shape == (3, 2) and (times >= 0.0).all()
+    assert "".join(done) == 3 * "-a-b"
+    assert pairs.describe_ratio(np.array([[1.0, 2.0], [2.0, 6.0], [1.0, 4.0]])) == [
+        "1e+06",
+        "4e+06",
+        "3.00",
+        "2.20 to 3.80",
+    ]
