@@ -1,4 +1,21 @@
-"""Compare the solver's claim with the judge's residual and build the `Solution`."""
+"""Compare the solver's claim with the judge's residual and build the `Solution`.
+
+With r the relative residual of the judge, "explained" r <= 1e-5 and at most twice the round-off floor, and "excused" an
+ill-conditioned M, or a solver that reads matrices only of a problem given by bodies or by J and M:
+
+    claimed status          r <= tol        r > tol, explained   r > tol, not explained
+    CONVERGED               CONVERGED       ROUNDOFF_LIMIT       CONVERGED, contradicted; excused: STALLED
+    STALLED                 CONVERGED       ROUNDOFF_LIMIT       STALLED
+    ROUNDOFF_LIMIT          ROUNDOFF_LIMIT  ROUNDOFF_LIMIT       ROUNDOFF_LIMIT, contradicted; excused: STALLED
+    MAX_ITERATIONS,
+      TIME_LIMIT            CONVERGED       unchanged            unchanged; STALLED if M is ill-conditioned
+    INFEASIBLE              CONVERGED       INFEASIBLE: confirmed, not proven or contradicted
+    DIVERGED, INTERRUPTED,
+      NUMERICAL_ERROR       unchanged       unchanged            unchanged
+
+CONVERGED in place of the claims of the fourth line needs tol > 0. If the floor is above tol, ROUNDOFF_LIMIT replaces
+every CONVERGED of the second column, and STALLED that of the last.
+"""
 
 from __future__ import annotations
 
