@@ -148,6 +148,12 @@ class SetUp:
         )
         self.failure = ""  # Arithmetic error that ended the set-up; empty if there was none.
 
+    @property
+    def checks_start(self) -> bool:
+        """Whether the solver's stopping test judges the start, too, and keeps the best impulse of each island."""
+        is_test = type(getattr(self.state, "watch", None)) is StoppingTest
+        return is_test and bool(self.solver.checks_start)
+
 
 class Prepared:
     """A solver prepared for a problem; `solve(problem2)` reuses the preparation if the structure is the same.
@@ -184,6 +190,11 @@ class Prepared:
 
     def __repr__(self) -> str:
         return f"<Prepared {self.spec.name} for {self.problem!r}>"
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether the solver is a backend or a plug-in, whose claims are checked."""
+        return self.spec.external or not self.spec.builtin
 
     @property
     def solver(self) -> Any:
@@ -419,56 +430,83 @@ class Prepared:
     # -- the run ---------------------------------------------------------------------------------
 
     def _run(self, loop: Loop, setup: SetUp, max_iter: int, has_default_start: bool) -> Solution:
-        """Run the solver unless the problem is decided without it, and build the solution."""
-        spec, problem, deadline = self.spec, loop.problem, loop.deadline
+        """Decide without the solver, or choose the start, run and select; then prove and finish."""
         setup_time = self.setup_time
         self.setup_time = 0.0
-        is_foreign = spec.external or not spec.builtin
         start = loop.impulse.copy()
         refutation = ""
-        proof = None
+        decided = self._decide_without_solver(loop, setup, max_iter)
+        if decided is None:
+            self._choose_start(loop, setup, start, has_default_start)
+            claim = loop.run(max_iter) if self.spec.resumable else loop.run_in_one_call(max_iter)
+            claim, refutation = self._select(loop, setup, claim, start)
+        else:
+            claim = decided
+        if claim.status is INFEASIBLE:
+            claim, refutation = self._prove(loop, claim, refutation, max_iter, decided is not None)
+        return self._finish(loop, claim, start, setup_time, refutation)
+
+    def _decide_without_solver(self, loop: Loop, setup: SetUp, max_iter: int) -> Claim | None:
+        """Return the claim of a problem that no solver can or may solve; else None."""
+        problem = loop.problem
+        deadline = loop.deadline
         if len(problem.metric.empty):
             proof = decide_empty_rows(problem, loop.impulse, loop.tol)
-        if proof is not None:
-            message, certificate, impossible = proof
-            claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
-            claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
-        elif setup.failure:
-            claim = Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
-        elif setup.solver is None or (
-            deadline is not None and deadline.has_passed() and not spec.external
-        ):
-            claim = Claim(TIME_LIMIT, 0)
+            if proof is not None:
+                message, certificate, impossible = proof
+                claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
+                return self._solve_with_zero_b(loop, claim, impossible, max_iter)
+        if setup.failure:
+            return Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
+        is_late = deadline is not None and deadline.has_passed() and not self.spec.external
+        if setup.solver is None or is_late:
             loop.keep_start()
-        else:
-            has_checks = (
-                type(getattr(setup.state, "watch", None)) is StoppingTest
-                and setup.solver.checks_start
+            return Claim(TIME_LIMIT, 0)
+        return None
+
+    def _choose_start(
+        self, loop: Loop, setup: SetUp, start: FloatArray, has_default_start: bool
+    ) -> None:
+        """Let the zero impulse replace a given start where it is better, unless the solver does this itself."""
+        problem = loop.problem
+        is_given = not (has_default_start or problem.has_singular_program)
+        if loop.tol > 0.0 and is_given and not (setup.checks_start or self.spec.delegates):
+            # The start is judged as given, as in compiled calls, but empty rows keep their bounds.
+            begin = choose_start(problem, start, loop.tol)
+            changed = (begin != start) & (loop.impulse == start)
+            loop.impulse[changed] = begin[changed]
+
+    def _select(
+        self, loop: Loop, setup: SetUp, claim: Claim, start: FloatArray
+    ) -> tuple[Claim, str]:
+        """Select the impulse to return, unless an own solver claims what the judge confirms."""
+        is_confirmed = not self.is_foreign and claim.status in (CONVERGED, ROUNDOFF_LIMIT)
+        if loop.tol > 0.0 and not is_confirmed:
+            return self._select_best_impulse(loop, claim, start, setup.checks_start)
+        return claim, ""
+
+    def _prove(
+        self, loop: Loop, claim: Claim, refutation: str, max_iter: int, is_decided: bool
+    ) -> tuple[Claim, str]:
+        """Check the claim of INFEASIBLE of a foreign solver, and solve the islands that the proof does not concern."""
+        if self.is_foreign:
+            claim, refutation = check_infeasibility_claim(
+                loop.problem, claim, loop.tol, loop.deadline or NEVER
             )
-            keeps_best = has_checks or spec.delegates  # Its result is never worse than the start.
-            is_given = not (has_default_start or problem.has_singular_program)
-            if loop.tol > 0.0 and not keeps_best and is_given:
-                # The start is judged as given, as in compiled calls, but empty rows keep their bounds.
-                begin = choose_start(problem, start, loop.tol)
-                changed = (begin != start) & (loop.impulse == start)
-                loop.impulse[changed] = begin[changed]
-            claim = loop.run(max_iter) if spec.resumable else loop.run_in_one_call(max_iter)
-            # Own solvers claim only what the judge confirms.
-            if loop.tol > 0.0 and (is_foreign or claim.status not in (CONVERGED, ROUNDOFF_LIMIT)):
-                claim, refutation = self._select_best_impulse(loop, claim, start, has_checks)
-        if claim.status is INFEASIBLE:
-            if is_foreign:
-                claim, refutation = check_infeasibility_claim(
-                    problem, claim, loop.tol, deadline or NEVER
-                )
-            if claim.certificate is not None and loop.tol > 0.0 and proof is None:
-                claim = self._solve_feasible_islands(loop, claim, max_iter)
+        if claim.certificate is not None and loop.tol > 0.0 and not is_decided:
+            claim = self._solve_feasible_islands(loop, claim, max_iter)
+        return claim, refutation
+
+    def _finish(
+        self, loop: Loop, claim: Claim, start: FloatArray, setup_time: float, refutation: str
+    ) -> Solution:
+        """Build the solution: the judge's residual, the status, the message."""
         if claim.judged is not loop.judged:
             claim = replace(claim, judged=loop.judged)
         return finish(
             FinishedRun(
-                problem,
-                spec,
+                loop.problem,
+                self.spec,
                 self.options,
                 loop.impulse,
                 claim,
@@ -479,7 +517,7 @@ class Prepared:
                 history=None if loop.records is None else loop.get_history(),
                 sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)),
                 refutation=refutation,
-                deadline=deadline or NEVER,
+                deadline=loop.deadline or NEVER,
             )
         )
 
