@@ -68,3 +68,60 @@ def test_state_of_a_block_that_does_not_exist_raises_and_states_the_number_of_bl
     assert states.names == ("free", "at a bound", "free") and states[-1].name == "free"
     with pytest.raises((IndexError, lv.InputError), match=r"there are 3 blocks|block is -1"):
         states[block]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_state_of_a_contact_changes_exactly_beyond_its_margin(seed):
+    """Normal and tangents have other diagonals d: y = b / d of a diagonal A, in N s."""
+    rng = np.random.default_rng(seed)
+    d = np.array([1.0, 1.0, 1.0]) * 10.0 ** rng.uniform(-2.0, 2.0, 3)[[0, 1, 1]]
+    mu = rng.uniform(0.2, 1.5)
+    normal = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 2.0)
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    y = np.array(
+        [
+            normal,
+            *(
+                abs(normal)
+                * mu
+                * rng.choice([0.3, 0.9, 1.1, 3.0])
+                * np.array([np.cos(angle), np.sin(angle)])
+            ),
+        ]
+    )
+
+    def find(change):
+        problem = lv.Problem.contact(np.diag(d), d * (y + change), mu=[mu])
+        return compute_states(problem, np.zeros(3))[0]
+
+    state = find(np.zeros(3))
+    along = y[1:] / np.linalg.norm(y[1:])
+    ways = [np.array([s, 0.0, 0.0]) for s in (-1.0, 1.0)] + [
+        np.array([0.0, *(s * along)]) for s in (-1.0, 1.0)
+    ]
+    # The limit of friction moves with the normal by mu: a change of the tangents alone meets it at the margin.
+    assert all(
+        find(0.99 * state.margin * way / max(1.0, mu * abs(way[0]))).name == state.name
+        for way in ways
+    )
+    assert any(find(1.01 * state.margin * way).name != state.name for way in ways)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_state_of_a_row_changes_exactly_beyond_its_margin(seed):
+    rng = np.random.default_rng(seed)
+    d = 10.0 ** rng.uniform(-2.0, 2.0)
+    low, high = -rng.uniform(0.1, 1.0), rng.uniform(0.1, 1.0)
+    y = rng.uniform(-2.0, 2.0)
+
+    def find(change):
+        problem = lv.Problem.lcp([[d]], [d * (y + change)], low, high)
+        return compute_states(problem, np.zeros(1))
+
+    states = find(0.0)
+    assert all(
+        find(s * 0.99 * states.margin[0]).case.tolist() == states.case.tolist() for s in (-1.0, 1.0)
+    )
+    assert any(
+        find(s * 1.01 * states.margin[0]).case.tolist() != states.case.tolist() for s in (-1.0, 1.0)
+    )
