@@ -754,6 +754,8 @@ NOT_CALLED = [
     "permute_velocities",
     "save_step",
     "step_from_mujoco",
+    "step_from_newton_mujoco",
+    "align_step",
     "MotionError",
     "SlipExplanation",
     "Redundancy",

@@ -27,6 +27,7 @@ MIN_IMPROVEMENT = 0.1
 # [-] Of several changes, the smallest one is proposed whose improvement is at most this much below the best.
 IMPROVEMENT_TOLERANCE = 0.05
 SETTABLE = ("mass", "force", "integrator", "softness", "friction")
+WEIGHT_TOLERANCE = 1e-4  # [-] The same, of inverse masses in float32.
 ROLE_WORDS = {
     "contact": ("contact", "contacts"), "limit": ("limit", "limits"),
     "equality": ("equality", "equalities"), "friction": ("joint's dry friction", "joints' dry friction"),
@@ -61,6 +62,7 @@ def list_facts(comparison: Difference) -> list[Fact]:
     a, b, pairing = comparison.a, comparison.b, comparison.pairing
     facts = [
         *_compare_matrices(a, b),
+        *_compare_weights(a, b, pairing),
         *_compare_rows(a, b, pairing),
         *_compare_softness(a, b, pairing),
     ]
@@ -137,6 +139,26 @@ def _compare_matrices(a: StepRecord, b: StepRecord) -> Iterator[Fact]:
         yield Fact("method", f"integrator: {names[0]} and {names[1]}")
 
 
+def _compare_weights(a: StepRecord, b: StepRecord, pairing: Pairing) -> Iterator[Fact]:
+    """Yield differences of the inverse masses from which the engines make compliances, if the masses are equal."""
+    pairs = [
+        (x, x.weight[0], b.blocks[j].weight[0])
+        for x, j in zip(a.blocks, pairing.partners[0], strict=True) if j >= 0
+    ]  # fmt: skip
+    if _differ(np.diag(a.mass), np.diag(b.mass)):
+        return
+    limit = WEIGHT_TOLERANCE if "float32" in (a.precision, b.precision) else RELATIVE_TOLERANCE
+    unlike = [(x, y, z) for x, y, z in pairs if abs(y - z) > limit * max(abs(y), abs(z))]
+    if unlike:
+        block, x, y = max(unlike, key=lambda p: abs(p[1] - p[2]) / max(abs(p[1]), abs(p[2])))
+        more = f" and {len(unlike) - 1} others" if len(unlike) > 1 else ""
+        yield Fact(
+            "mass",
+            f"inverse mass (invweight) that the engine uses for the compliance of {block.key}{more}: {x:.4g} and "
+            f"{y:.4g} 1/kg, with equal masses",
+        )
+
+
 def _compare_rows(a: StepRecord, b: StepRecord, pairing: Pairing) -> Iterator[Fact]:
     """Yield rows that only one record has, and differences of gaps and axes."""
     for side, (own, other) in enumerate(((a, b), (b, a))):
@@ -163,7 +185,9 @@ def _compare_rows(a: StepRecord, b: StepRecord, pairing: Pairing) -> Iterator[Fa
             )
     pairs = [(x, b.blocks[j]) for x, j in zip(a.blocks, pairing.partners[0], strict=True) if j >= 0]
     gaps = [(abs(x.gap[0] - y.gap[0]), x, y) for x, y in pairs if len(x.gap) and len(y.gap)]
-    moved = [g for g in gaps if _differ(g[1].gap[0], g[2].gap[0])]
+    is_float32 = "float32" in (a.precision, b.precision)
+    limit = WEIGHT_TOLERANCE if is_float32 else RELATIVE_TOLERANCE
+    moved = [g for g in gaps if g[0] > limit * abs(g[1].gap[0]) + 1e-12]
     if moved:
         _, x, y = max(moved, key=lambda g: g[0])
         rest = f" ({format_count(len(moved), 'row')} differ)" if len(moved) > 1 else ""

@@ -37,6 +37,7 @@ from lavender.io.recording import Recording, record
 from lavender.io.step_record import StepRecord, load_step, permute_velocities, save_step
 from lavender.io.stored import HDF5, as_path, read_bytes
 from lavender.io.velocities import Reconstruction, reconstruct
+from lavender.io.warp_step import align_step, step_from_newton_mujoco
 from lavender.problem import Problem
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "StepRecord",
     "StepVerdict",
     "Stored",
+    "align_step",
     "drake",
     "efc",
     "from_drake",
@@ -71,6 +73,7 @@ __all__ = [
     "save",
     "save_step",
     "step_from_mujoco",
+    "step_from_newton_mujoco",
 ]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 

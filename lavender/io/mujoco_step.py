@@ -70,7 +70,7 @@ def step_from_mujoco(model: Any, data: Any, *, engine: str | None = None) -> Ste
             "integrator RK4 solves the constraints four times in each step, so that one step has no causes: compare "
             "with another integrator"
         )
-    return _Reader(mj, without_sleep(mj, model), data).read(engine or f"MuJoCo {mj.__version__}")
+    return StepReader(mj, without_sleep(mj, model), data).read(engine or f"MuJoCo {mj.__version__}")
 
 
 @dataclass
@@ -81,20 +81,32 @@ class _Rows:
     rows: IntArray
 
 
-class _Reader:
-    """One model and the state before its step."""
+class StepReader:
+    """One model and the state before its step.
+
+    `data` has the arrays of the step, and `host` is the MjData of the same positions.
+    """
+
+    # [-] Largest relative difference of R and of references from the impedance model.
+    tolerance = MODEL_TOLERANCE
+    precision = "float64"
 
     def __init__(self, mj: Any, model: Any, data: Any) -> None:
         self.mj, self.model = mj, model
         self.start = data
         self.data = self.copy(data)
         mj.mj_forward(model, self.data)
-        self.dt = float(model.opt.timestep)
-        self.nv = int(model.nv)
+        self.host = self.data
         if not np.isfinite(self.data.qacc).all():
             raise CapabilityError(single.DIVERGED_TEXT)
         self.is_discrete = read_step(model, self.data).is_discrete
         self.jacobian = single.jacobian(model, self.data).toarray()
+        self.name_elements()
+
+    def name_elements(self) -> None:
+        """Find the names of bodies, geoms and joints."""
+        model = self.model
+        self.dt, self.nv = float(model.opt.timestep), int(model.nv)
         self.bodies = [_name(model.body(i), "body", i) for i in range(model.nbody)]
         self.geoms = [model.geom(i).name or str(i) for i in range(model.ngeom)]
         self.joints = [_name(model.joint(i), "joint", i) for i in range(model.njnt)]
@@ -107,9 +119,15 @@ class _Reader:
 
     def read(self, engine: str) -> StepRecord:
         """Build the record."""
-        mj, model, data, dt, nv = self.mj, self.model, self.data, self.dt, self.nv
+        mj, model, data = self.mj, self.model, self.data
         after = self.copy(self.start)  # With the same warm start.
         mj.mj_step(model, after)
+        moved_by = single.find_mover(read_step(model, data), False)
+        return self.build(engine, np.array(after.qvel), moved_by)
+
+    def build(self, engine: str, velocity_after: FloatArray, moved_by: str) -> StepRecord:
+        """Build the record of a step with a known result."""
+        mj, model, data, dt, nv = self.mj, self.model, self.data, self.dt, self.nv
         mass = self.read_mass()
         smooth = np.array(data.qfrc_smooth)
         integrator_force = np.zeros(nv)
@@ -144,10 +162,9 @@ class _Reader:
         coriolis = np.array(data.qfrc_bias) + self.bias_map @ gravity
         force = smooth - damping_force - actuator_force - (gravity_map @ gravity - coriolis)
         groups = self.read_blocks(mass, added)
-        moved_by = single.find_mover(read_step(model, data), False)
         names, angular = self.name_velocities()
         return StepRecord(
-            engine=engine, dt=dt, velocity=np.array(data.qvel), velocity_after=np.array(after.qvel),
+            engine=engine, dt=dt, velocity=np.array(data.qvel), velocity_after=velocity_after,
             mass=mass, coriolis=coriolis, gravity_map=gravity_map, gravity=gravity, force=force,
             damping_matrix=damping, damping_force=damping_force, actuator_matrix=actuators,
             actuator_force=actuator_force, integrator_matrix=rest, integrator_force=integrator_force,
@@ -158,6 +175,7 @@ class _Reader:
             acceleration=np.array(data.qacc), moved_by=moved_by,
             before_noslip=self.read_forces_before_noslip(groups), weights=self.read_weights(),
             softnesses=self.read_softnesses(), settings=self.read_settings(),
+            precision=self.precision,
         )  # fmt: skip
 
     def read_mass(self) -> FloatArray:
@@ -178,13 +196,13 @@ class _Reader:
         scratch = self.mj.MjData(model)
         accelerations = np.linalg.inv(mass)
         for i in range(self.nv):
-            mj.mj_copyData(scratch, model, self.data)
+            mj.mj_copyData(scratch, model, self.host)
             scratch.qfrc_constraint[:] = 0.0
             scratch.qfrc_constraint[i] = 1.0
             scratch.qfrc_smooth[:] = 0.0
             scratch.qacc[:] = accelerations[:, i]
             advance(model, scratch)
-            inverse[:, i] = (scratch.qvel - self.data.qvel) / self.dt
+            inverse[:, i] = (scratch.qvel - self.host.qvel) / self.dt
         return np.linalg.inv(inverse) - mass
 
     def read_damping(self) -> FloatArray:
@@ -214,13 +232,13 @@ class _Reader:
         rows = self.read_tendon_jacobian() if len(springs) else matrix
         for i in springs:
             low, high = model.tendon_lengthspring[i]
-            if not low <= self.data.ten_length[i] <= high:
+            if not low <= self.host.ten_length[i] <= high:
                 matrix += model.tendon_stiffness[i] * np.outer(rows[i], rows[i])
         return matrix
 
     def read_tendon_jacobian(self) -> FloatArray:
         """Return the Jacobian of tendon lengths (ntendon, nv)."""
-        model, data = self.model, self.data
+        model, data = self.model, self.host
         values = np.ravel(data.ten_J)
         if len(values) == model.ntendon * self.nv:
             return values.reshape(model.ntendon, self.nv)
@@ -233,7 +251,7 @@ class _Reader:
 
     def read_actuator_matrix(self) -> FloatArray:
         """Return minus the derivative of actuator forces by the velocity (nv, nv), for affine gains and biases."""
-        model, data = self.model, self.data
+        model, data = self.model, self.host
         if not model.nu:
             return np.zeros((self.nv, self.nv))
         moment = np.zeros((len(data.moment_rownnz), self.nv))
@@ -253,7 +271,7 @@ class _Reader:
 
     def read_gravity(self) -> tuple[FloatArray, FloatArray]:
         """Return the force per gravitational acceleration (nv, 3) and the acceleration (3,)."""
-        mj, model, data = self.mj, self.model, self.data
+        mj, model, data = self.mj, self.model, self.host
         per_body = np.zeros((3, self.nv))
         mj.mj_jacSubtreeCom(model, data, per_body, 0)
         total = float(model.body_mass.sum())
@@ -363,8 +381,8 @@ class _Reader:
             settings[name] = float(getattr(option, name))
         for name in ("iterations", "noslip_iterations"):
             settings[name] = int(getattr(option, name))
-        settings["control"] = tuple(map(float, self.data.ctrl))
-        settings["activation"] = tuple(map(float, self.data.act))
+        settings["control"] = tuple(map(float, self.host.ctrl))
+        settings["activation"] = tuple(map(float, self.host.act))
         return settings
 
     def read_blocks(self, mass: FloatArray, added: FloatArray) -> list[_Rows]:
@@ -411,7 +429,7 @@ class _Reader:
                 values = model.tendon_solref_fri, model.tendon_solimp_fri
             else:
                 is_upper = data.efc_pos[rows[0]] == (
-                    model.tendon_range[which][1] - data.ten_length[which]
+                    model.tendon_range[which][1] - self.host.ten_length[which]
                 )
                 key = upper if is_upper else lower
                 values = model.tendon_solref_lim, model.tendon_solimp_lim
@@ -491,20 +509,27 @@ class _Reader:
         total = np.zeros((6, self.nv))
         part = np.zeros((6, self.nv))
         for sign, body in zip((-1.0, 1.0), bodies, strict=True):
-            self.mj.mj_jac(self.model, self.data, part[:3], part[3:], np.array(contact.pos), body)
+            self.mj.mj_jac(self.model, self.host, part[:3], part[3:], np.array(contact.pos), body)
             total += sign * part
         return np.vstack([frame @ total[:3], frame @ total[3:]])
+
+    def read_rates(
+        self, block: ConstraintBlock, rows: IntArray, rates: FloatArray, springs: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the engine's own B [1/s], K d [1/s^2] and d [-] of rows; `rates` and `springs` are the model's."""
+        own = self.data.efc_KBIP.reshape(-1, 4)[rows]
+        return own[:, 1].copy(), own[:, 0] * own[:, 2], own[:, 2].copy()
 
     def check(self, group: _Rows, mass: FloatArray, added: FloatArray) -> _Rows:
         """Return the rows, with a softness of plain numbers if MuJoCo's arrays do not follow its impedance model."""
         data, block, rows = self.data, group.block, group.rows
         is_pyramid = block.has_friction and block.cone == "pyramid"
-        own = data.efc_KBIP.reshape(-1, 4)[rows]
         count = block.condim if block.role == "contact" else len(rows)
         rates, springs = compute_reference(block, block.softness, block.softness, count)
         at = np.zeros(len(rows), int) if is_pyramid else np.arange(len(rows))
-        fits = np.allclose(own[:, 1], rates[at], rtol=MODEL_TOLERANCE, atol=0.0)
-        fits &= np.allclose(own[:, 0] * own[:, 2], springs[at], rtol=MODEL_TOLERANCE, atol=0.0)
+        rate, spring, impedance = self.read_rates(block, rows, rates[at], springs[at])
+        fits = np.allclose(rate, rates[at], rtol=MODEL_TOLERANCE, atol=0.0)
+        fits &= np.allclose(spring, springs[at], rtol=MODEL_TOLERANCE, atol=0.0)
         scale = np.ones(len(rows))
         if self.is_discrete:
             scale = 1.0 / (1.0 + self.dt * rates + self.dt**2 * springs)[at]
@@ -516,7 +541,7 @@ class _Reader:
             if block.role == "contact":
                 scale[:] = scale[0]
         if np.isnan(block.weight).any():
-            d = own[0, 2]
+            d = impedance[0]
             weight = data.efc_R[rows] / scale * d / (1.0 - d)
             if block.role == "contact":
                 mu = block.friction[0]
@@ -527,21 +552,19 @@ class _Reader:
         made = compute_compliance(
             block, block.softness, block.weight, block.friction[: max(block.condim - 1, 0)], cone
         )
-        fits &= np.allclose(made * scale, data.efc_R[rows], rtol=MODEL_TOLERANCE, atol=1e-15)
-        block = replace(block, bias=self.read_bias(block, rows, rates, springs))
+        fits &= np.allclose(made * scale, data.efc_R[rows], rtol=self.tolerance, atol=1e-15)
+        block = replace(block, bias=self.read_bias(block, rows, rate, spring))
         if not fits:
             block = replace(
-                block, softness=self.copy_numbers(block, rows, scale, count, is_pyramid)
+                block, softness=self.copy_numbers(block, rows, scale, count, rate, spring)
             )
         return _Rows(block, rows)
 
     def read_bias(
-        self, block: ConstraintBlock, rows: IntArray, rates: FloatArray, springs: FloatArray
+        self, block: ConstraintBlock, rows: IntArray, rate: FloatArray, spring: FloatArray
     ) -> FloatArray | None:
         """Return the reference acceleration (k,) that does not follow from gap and velocity; None without it."""
         data, dt = self.data, self.dt
-        own = data.efc_KBIP.reshape(-1, 4)[rows]
-        rate, spring = own[:, 1], own[:, 0] * own[:, 2]
         if self.is_discrete:
             phi = 1.0 / (1.0 + dt * rate + dt**2 * spring)
             rate, spring = (rate + dt * spring) * phi, spring * phi
@@ -550,7 +573,7 @@ class _Reader:
         model = -rate * data.efc_vel[rows] - spring * (data.efc_pos[rows] - data.efc_margin[rows])
         bias = np.array(data.efc_aref[rows] - model) / phi
         size = np.abs(model) + np.abs(rate * data.efc_vel[rows])
-        if (np.abs(bias) <= MODEL_TOLERANCE * np.maximum(size, size.max())).all():
+        if (np.abs(bias) <= self.tolerance * np.maximum(size, size.max())).all():
             return None
         if block.has_friction and block.cone == "pyramid":
             halves = bias[0::2] - bias[1::2]
@@ -563,17 +586,15 @@ class _Reader:
         rows: IntArray,
         scale: FloatArray,
         count: int,
-        is_pyramid: bool,
+        rate: FloatArray,
+        spring: FloatArray,
     ) -> Softness:
         """Return a softness of MuJoCo's own numbers."""
-        own = self.data.efc_KBIP.reshape(-1, 4)[rows]
         compliance = self.data.efc_R[rows] / scale
-        if is_pyramid:
-            rate, spring = np.full(count, own[0, 1]), np.zeros(count)
-            spring[0] = own[0, 0] * own[0, 2]
+        if block.has_friction and block.cone == "pyramid":
+            rate = np.full(count, rate[0])
+            spring = np.append(spring[0], np.zeros(count - 1))
             compliance = np.full(count, compliance[0] / (2.0 * (count - 1)))
-        else:
-            rate, spring = own[:, 1].copy(), own[:, 0] * own[:, 2]
         return replace(
             block.softness, rule="rates", rate=rate, stiffness=spring, compliance=compliance
         )
