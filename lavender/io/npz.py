@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,29 @@ COMPRESSED = ("data", "indices", "indptr")
 FORMS = ("dense", "csr", "rows", "generalized", "program")
 PROGRAM = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 MOTION = ("engine_change", "engine_compliance", "engine_momentum")
+ENGINE_ENTRIES = ("engine_impulse", *MOTION)
+USER = "user/"  # Entries below this name, and the key "user" of `meta`, belong to the user and are not read.
+META_KEYS = {"operator", "friction", "name", "names", "precision", "user"}
+
+
+def _list_matrix_entries(name: str, *more: str) -> set[str]:
+    """Return the names of the entries of a compressed matrix."""
+    return {f"{name}_{part}" for part in (*COMPRESSED, *more)}
+
+
+PROGRAM_ENTRIES = {*PROGRAM}.union(*(_list_matrix_entries(name, "shape") for name in "PGA"))
+#: Entries of every operator, and those of each.
+ENTRIES = {"lavender_format", "meta", "guess", "key", "angular", "impulse"}
+CONSTRAINTS = {"b", *CONES, "cones_rolling"}
+ENTRIES_OF: dict[str, set[str]] = {
+    "dense": {"A", *CONSTRAINTS},
+    "csr": _list_matrix_entries("A", "shape") | CONSTRAINTS,
+    "rows": {*ROWS, "compliance", *CONSTRAINTS},
+    "generalized": _list_matrix_entries("general_jac")
+    | _list_matrix_entries("general_mass")
+    | {"general_v_free", "compliance", *ENGINE_ENTRIES, *CONSTRAINTS},
+    "program": {*PROGRAM_ENTRIES, "compliance"},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +102,7 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
             impulse, slack = (_read_vector(archive, name, problem) for name in ("l_ref", "w_ref"))
             return Stored(problem, "box", impulse, slack, str(compare[0]))
         if "q" in archive:
+            _check_known("entry", archive, PROGRAM_ENTRIES)
             return Stored(_read_program(archive, name=Path(path).stem), "program")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -163,7 +187,15 @@ def _read_own_format(archive: Arrays) -> Stored:
             f"lavender_format is {version!r:.60}; this lavender reads {FORMAT_VERSION}: update it"
         )
     meta = _read_meta(archive)
+    operator = meta["operator"]
+    _check_known("entry", archive, ENTRIES_OF[operator] | ENTRIES)
+    more = {"dof_names", "moved_by"} if operator == "generalized" else set()
+    _check_known("key of the entry 'meta':", meta, META_KEYS | more)
+    if "moved_by" not in meta and (engine := [x for x in ENGINE_ENTRIES if x in archive]):
+        raise InputError(f"entry {engine[0]!r} needs the key 'moved_by' in the entry 'meta'")
     for name in archive:
+        if name.startswith(USER):
+            continue
         if archive[name].dtype.kind not in "iuf":
             raise InputError(f"entry {name!r} has dtype {archive[name].dtype}; numbers are needed")
     parts: dict[str, Any] = {
@@ -218,6 +250,21 @@ def _read_own_format(archive: Arrays) -> Stored:
             moved, change, compliance, moved_by, *momentum
         )
     return Stored(problem, "lavender", impulse=impulse)
+
+
+def _check_known(kind: str, given: Iterable[str], known: set[str]) -> None:
+    """Raise InputError for a name that is not known and not the user's own."""
+    for name in given:
+        if name in known or name.startswith(USER):
+            continue
+        import difflib  # Imported here, as it is needed only for this message.
+
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(sorted(known))}."
+        raise InputError(
+            f"the {kind} {name!r} is unknown: {hint} Your own data go into entries below {USER!r}, or into the key "
+            "'user' of the entry 'meta'"
+        )
 
 
 def _read_meta(archive: Arrays) -> dict[str, Any]:

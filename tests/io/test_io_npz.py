@@ -345,3 +345,47 @@ def test_save_over_a_file_keeps_its_permissions(tmp_path, mode):
     path.chmod(mode)
     problem.save(path)
     assert path.stat().st_mode & 0o777 == mode
+
+
+@pytest.mark.parametrize("kind", ["dense", "csr", "rows", "generalized", "program"])
+def test_unknown_entries_and_keys_are_refused_by_name_except_the_users_own(tmp_path, kind):
+    A = np.array([[2.0, 1.0], [1.0, 2.0]])
+    cones = lv.Cones.contacts(0.5, tangents=1)
+    problem = {
+        "dense": lambda: lv.Problem.lcp(A, [1.0, 1.0]),
+        "csr": lambda: lv.Problem.lcp(sp.csr_array(A), [1.0, 1.0]),
+        "rows": lambda: lv.suite.case("stack(n=2)").problem,
+        "generalized": lambda: lv.Problem.from_jacobian(A, A, [1.0, 0.0], cones=cones),
+        "program": lambda: lv.Problem.from_qp(A, [1.0, 1.0], lb=[0.0, 0.0]),
+    }[kind]()
+    path = tmp_path / "a.npz"
+    problem.save(path)
+    entries = dict(np.load(path))
+    meta = json.loads(bytes(entries["meta"]).decode())
+    assert meta["operator"] == kind
+
+    def read(changes, **keys):
+        text = np.frombuffer(json.dumps(meta | keys).encode(), np.uint8)
+        np.savez(path, **(entries | {"meta": text} | changes))
+        return lavender.io.load(path)
+
+    assert (
+        read({"user/robot": np.arange(3.0), "user/notes": np.array("text")}, user={"a": 1})
+        == problem
+    )
+    other = {"rows_inv_mass": np.ones(2)} if kind != "rows" else {"A": A}
+    for changes in ({"guesss": np.ones(problem.m)}, {"Impulse": np.ones(problem.m)}, other):
+        with pytest.raises(lv.InputError, match=f"entry '{next(iter(changes))}' is unknown"):
+            read(changes)
+    for key in ("foo", "frictions"):
+        with pytest.raises(lv.InputError, match=f"'meta': '{key}' is unknown"):
+            read({}, **{key: 1})
+    with pytest.raises(lv.InputError, match="this lavender reads 1: update it"):
+        read({"lavender_format": np.int64(2), "new": np.ones(1)})
+
+
+def test_misspelt_array_of_a_plain_program_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, P=np.eye(2), q=np.ones(2), lbb=np.zeros(2))
+    with pytest.raises(lv.InputError, match="entry 'lbb' is unknown: did you mean 'lb'"):
+        lavender.io.load(path)
