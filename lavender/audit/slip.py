@@ -62,7 +62,7 @@ MIN_EARLIER_FRACTION = 0.5
 class Remedy:
     """Slip of the fastest contact with a setting of MuJoCo, simulated from several states.
 
-    Steps in which the geoms do not touch have no slip and do not count.
+    Any geoms of the two bodies count. Steps in which the bodies do not touch have no slip and do not count.
     """
 
     # Text for the model's file; the first remedy of an explanation is the model without a change.
@@ -75,7 +75,7 @@ class Remedy:
     # no run diverged.
     diverged_step: int = -1
     touching: float = 0.0  # Fraction of these steps with contact.
-    kept: int = 0  # Number of states in which the geoms touch in the last of these steps.
+    kept: int = 0  # Number of states in which the bodies touch in the last of these steps.
     # [m/s] (1 + REMEDY_STEPS,) tuple: mean speed in each step, from the explained one on; nan without contact.
     speeds: tuple[float, ...] = ()
 
@@ -120,6 +120,9 @@ class SlipExplanation:
     # Settings that were simulated, if the model is known and this is its state with the fastest contact.
     remedies: tuple[Remedy, ...] = ()
     n_states: int = 0  # Number of states from which the settings were simulated.
+    followed: str = (
+        ""  # Names of the two bodies with the contacts that are followed in the simulated settings.
+    )
     state: int = 0  # Index of the state among the given ones.
 
     def __str__(self) -> str:
@@ -288,7 +291,8 @@ class SlipExplanation:
         helpful = [r for r in stable if get_slip(r) <= MAX_REMAINING_SLIP * before]
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
-        head = f"Settings that help (mean slip {time}, {format_size(before)} m/s as it is):"
+        pair = f" of {self.followed}" if self.followed else ""
+        head = f"Settings that help (mean slip{pair} {time}, {format_size(before)} m/s as it is):"
         helpful.sort(key=get_slip)
         lost = {
             r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,9 @@ from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
 
+MIN_LASTING_SHARE = (
+    0.5  # A pair of bodies lasts if it touches in at least this share of the states.
+)
 MAX_REMEDY_STATES = (
     8  # Settings are simulated from up to this many states, those with the largest slip.
 )
@@ -60,8 +63,9 @@ class SlipOfStates:
 
     @property
     def worst(self) -> SlipExplanation:
-        """The explanation with the fastest contact; there must be at least one explanation."""
-        return max(self.explanations, key=lambda e: _find_fastest(e)[0])
+        """The explanation that has settings, else the one with the fastest contact; there must be at least one."""
+        simulated = (e for e in self.explanations if e.remedies)
+        return next(simulated, max(self.explanations, key=lambda e: e.speeds.max()))
 
     @property
     def table(self) -> pd.DataFrame:
@@ -247,21 +251,24 @@ def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipEx
 def _simulate_remedies(
     mj: Any, model: Any, explanations: list[SlipExplanation], starts: list[FloatArray], watch: Any
 ) -> None:
-    """Simulate settings from the states in which the fastest contact slides fastest, and add their results."""
-    fastest = max(range(len(explanations)), key=lambda k: _find_fastest(explanations[k])[0])
-    speed, pair = _find_fastest(explanations[fastest])
-    i = int(np.argmax(explanations[fastest].speeds))
-    use = explanations[fastest].friction_use
-    if not speed > MIN_EXPLAINED_SLIP or (use is not None and np.isnan(use[i])):
+    """Simulate settings from the states in which the followed pair slides fastest, and add their results.
+
+    The followed pair of bodies has the fastest contact of the pairs that touch in at least half of the states: any
+    geoms of the two bodies count, because a pad may hold when the mesh beside it separates.
+    """
+    points = pd.concat([e.slips.assign(k=k, use=_get_uses(e)) for k, e in enumerate(explanations)])
+    points["bodies"] = [find_bodies(mj, model, contact) for contact in points["contact"]]
+    lasting = points.groupby("bodies")["k"].nunique()
+    lasting = lasting.index[lasting >= MIN_LASTING_SHARE * len(explanations)]
+    candidates = points[points["bodies"].isin(lasting)] if len(lasting) else points
+    first = candidates.iloc[int(candidates["speed"].to_numpy().argmax())]
+    if not first["speed"] > MIN_EXPLAINED_SLIP or np.isnan(first["use"]):
         return  # No setting changes the slip of a contact without normal force.
-    sliding = [
-        (speed, k)
-        for k, e in enumerate(explanations)
-        for contact, speed in average_slip([e])[["contact", "speed"]].itertuples(index=False)
-        if contact == pair
-    ]
-    chosen = [starts[k] for _, k in sorted(sliding, reverse=True)[:MAX_REMEDY_STATES]]
-    settings = list(_change_settings(mj, model, pair))
+    pair, fastest = str(first["bodies"]), int(first["k"])
+    own = points[points["bodies"] == pair]
+    sliding = own.groupby("k")["speed"].mean().sort_values(ascending=False, kind="stable")
+    chosen = [starts[k] for k in sliding.index[:MAX_REMEDY_STATES]]
+    settings = list(_change_settings(mj, model, pair, own["contact"]))
     remedies: list[Remedy] = []
     for k, (text, changed) in enumerate(settings):
         if watch is not None:
@@ -277,20 +284,42 @@ def _simulate_remedies(
         step = min((step for step in steps if step >= 0), default=-1)
         remedies.append(Remedy.of_runs(text, np.array([speeds for speeds, _ in results]), step))
     explanations[fastest] = replace(
-        explanations[fastest], remedies=tuple(remedies), n_states=len(chosen)
+        explanations[fastest], remedies=tuple(remedies), n_states=len(chosen), followed=pair
     )
 
 
-def _find_fastest(explanation: SlipExplanation) -> tuple[float, str]:
-    """Return the sliding speed of the fastest contact [m/s] and the names of its geoms."""
-    slips = explanation.slips
-    return max(zip(slips["speed"], slips["contact"].map(get_geoms), strict=True))
+def _get_uses(explanation: SlipExplanation) -> FloatArray:
+    """Return the friction use of each contact; 0 if it is not known, nan without a normal force."""
+    use = explanation.friction_use
+    return np.zeros(len(explanation.contacts)) if use is None else use
 
 
-def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any]]:
-    """Yield the text of each setting that can reduce the slip of two geoms, with the changed model.
+def find_bodies(mj: Any, model: Any, contact: str) -> str:
+    """Return the names of the two bodies of a contact, sorted; bodies that are welded together have one name.
 
-    The first is the model itself.
+    Without two geoms, as for a flex, it is the names of the sides themselves.
+    """
+    sides = get_geoms(contact).split(", ")
+    geoms = [_find_geom(mj, model, side) for side in sides]
+    if len(geoms) != 2 or min(geoms) < 0:
+        return get_geoms(contact)
+    bodies = [int(model.body_weldid[model.geom_bodyid[geom]]) for geom in geoms]
+    kind = mj.mjtObj.mjOBJ_BODY
+    return " and ".join(sorted(mj.mj_id2name(model, kind, b) or f"body {b}" for b in bodies))
+
+
+def _find_geom(mj: Any, model: Any, name: str) -> int:
+    """Return the number of a geom by its name, or by its number if it has no name; -1 if there is none."""
+    geom = int(mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name))
+    return int(name) if geom < 0 and name.isdigit() and int(name) < model.ngeom else geom
+
+
+def _change_settings(
+    mj: Any, model: Any, pair: str, contacts: Iterable[str]
+) -> Iterator[tuple[str, Any]]:
+    """Yield the text of each setting that can reduce the slip of two bodies, with the changed model.
+
+    `contacts` are the names of their contacts. The first model is the model itself.
     """
     yield "as it is", model
     options: list[dict[str, Any]] = [
@@ -309,21 +338,22 @@ def _change_settings(mj: Any, model: Any, geoms: str) -> Iterator[tuple[str, Any
             solref[solref[:, 0] > shortest] = shortest, 1.0
         yield f'solref="{shortest:g} 1" of all geoms', changed
 
-    numbers = [mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name) for name in geoms.split(", ")]
-    if len(numbers) == 2 and min(numbers) >= 0:
+    names = list(dict.fromkeys(x for c in contacts for x in get_geoms(c).split(", ")))
+    numbers = [_find_geom(mj, model, name) for name in names]
+    if " and " in pair and numbers and min(numbers) >= 0:
         changed = copy.deepcopy(model)
         friction = FRICTION_FACTOR * float(model.geom_friction[numbers, 0].max())
         changed.geom_friction[numbers, 0] = friction
         is_own_pair = np.isin(model.pair_geom1, numbers) & np.isin(model.pair_geom2, numbers)
         changed.pair_friction[is_own_pair, :2] *= FRICTION_FACTOR
-        yield f'friction="{friction:g}" of {" and ".join(geoms.split(", "))}', changed
+        yield f'friction="{friction:g}" of {" and ".join(names)}', changed
 
 
-def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[FloatArray, int]:
-    """Return the sliding speeds of two geoms (1 + REMEDY_STEPS,) [m/s] in the steps from a state.
+def _simulate_slip(mj: Any, model: Any, state: FloatArray, pair: str) -> tuple[FloatArray, int]:
+    """Return the sliding speeds of two bodies (1 + REMEDY_STEPS,) [m/s] in the steps from a state.
 
-    A speed is nan if the geoms do not touch in this step. The second result is the step in which the simulation
-    diverges (0 is the first), from which on all speeds are nan, or -1.
+    A speed is nan if no geoms of the two bodies touch in this step. The second result is the step in which the
+    simulation diverges (0 is the first), from which on all speeds are nan, or -1.
     """
     data = mj.MjData(model)
     means = np.full(REMEDY_STEPS + 1, np.nan)
@@ -340,7 +370,7 @@ def _simulate_slip(mj: Any, model: Any, state: FloatArray, geoms: str) -> tuple[
         names = name_blocks(record)
         sliding = [
             read_slip(block) for name, block in zip(names, record.blocks, strict=True)
-            if block.has_friction and get_geoms(name) == geoms
+            if block.has_friction and find_bodies(mj, model, name) == pair
         ]  # fmt: skip
         speeds = [np.linalg.norm(rows @ data.qvel - surface) for rows, surface in sliding]
         if speeds:

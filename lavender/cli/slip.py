@@ -93,7 +93,8 @@ def slip(
     print_escaped("\n".join(worst.sentences))
     if worst.remedies:
         print_escaped(
-            f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip:"
+            f"\nSettings simulated from {format_count(worst.n_states, 'state')}, mean slip of {worst.followed} "
+            "(any geoms of the two bodies):"
         )
         print_table(console, worst.remedies_table)
         print_escaped("\n".join(worst.advice))

@@ -1,5 +1,7 @@
 """The cause of slip of scenes whose answer is known."""
 
+import re
+
 import numpy as np
 import pytest
 from mujoco_scene import get_state
@@ -397,3 +399,48 @@ def test_problem_of_mujoco_knows_its_pyramids_and_the_speed_of_a_belt(cone):
             explain_slip(problem, impulse)
     else:
         assert set(explain_slip(problem, impulse).causes) == {"speed of the surface is not known"}
+
+
+# Two fingers press a can from both sides; each has a pad, and a back plate that separates when a setting changes.
+TWO_GEOMS = """<mujoco><option timestep="0.002"/><worldbody>
+<body name="left" pos="-.05 0 1"><joint name="l" type="slide" axis="1 0 0" damping="20"/>
+ <geom type="box" size=".01 .01 .01" pos="0.0006 0 0.005" friction="2" solref="0.01 0.5" mass=".1"/>
+ <geom type="box" size=".01 .02 .02" friction="1" condim="4" mass=".1"/></body>
+<body name="right" pos=".05 0 1"><joint name="r" type="slide" axis="-1 0 0" damping="20"/>
+ <geom type="box" size=".01 .01 .01" pos="-0.0006 0 0.005" friction="2" solref="0.01 0.5" mass=".1"/>
+ <geom type="box" size=".01 .02 .02" friction="1" condim="4" mass=".1"/></body>
+<body name="can" pos="0 0 1"><freejoint/><geom name="can" type="box" size=".03 .02 .02" mass=".25"/></body>
+</worldbody><actuator><motor joint="l" gear="30"/><motor joint="r" gear="30"/></actuator></mujoco>"""
+
+
+def test_slip_follows_two_bodies_whose_geoms_take_turns():
+    model = mujoco.MjModel.from_xml_string(TWO_GEOMS)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1.0
+    states = []
+    for step in range(520):
+        mujoco.mj_step(model, data)
+        if step >= 400 and step % 40 == 0:
+            states.append(get_state(model, data))
+    worst = explain_slip_of_states(model, {"state": np.array(states)}, contacts="can").worst
+    assert worst.followed in ("can and left", "can and right") and len(worst.remedies) > 4
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    finger, can = (model.body(name).id for name in (worst.followed.split(" and ")[1], "can"))
+    for remedy in worst.remedies[:5]:
+        changed = mujoco.MjModel.from_xml_string(TWO_GEOMS)
+        for name, value in re.findall(r'(\w+)="([^"]+)"', remedy.setting):
+            value = {"elliptic": 1, "pyramidal": 0}.get(value, value)
+            setattr(changed.opt, name, type(getattr(changed.opt, name))(value))
+        touches = []
+        for state in states:
+            data = mujoco.MjData(changed)
+            mujoco.mj_setState(changed, data, state, kind)
+            for step in range(1 + REMEDY_STEPS):
+                mujoco.mj_forward(changed, data)
+                bodies = changed.geom_bodyid[data.contact.geom]
+                touches += [any(set(pair) == {finger, can} for pair in bodies.tolist())] * (
+                    step > 0
+                )
+                mujoco.mj_step(changed, data)
+        assert remedy.touching == pytest.approx(np.mean(touches)), remedy.setting
+    assert "states keep contact" not in "".join(worst.advice)
