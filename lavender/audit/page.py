@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,7 @@ SHOWN_RATIO = (
 TREND_RATIO = (
     2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
 )
+MIN_TREND_SHARE = 0.05  # Share of the steps that has to exceed it; fewer are isolated spikes.
 MAX_NAMED_ROWS = 8  # Rows of the table of rows.
 CLASS_COLORS = ("var(--h4)", "var(--h3)", "var(--h1)", "var(--bad)", "var(--ink)")
 ERROR_DEFINITION = (
@@ -64,8 +66,8 @@ ERROR_DEFINITION = (
     "law allows, in m/s, or rad/s on angular rows. Rounding only: rounding explains the error, in the engine's "
     "precision. The errors are of the integrator's input for each step: the residual of forces, or the distance of an "
     "acceleration's velocities from the exact ones (Euler's method without damping, discrete, RK4). They do not add up "
-    "over time. Growing: the error that 1 % of the steps exceed in the last quarter is more than twice that of the "
-    "second quarter."
+    "over time. Growing: at least 5 % of the steps in the last quarter have more than twice the error that 1 % of the "
+    "steps exceed in the second quarter; fewer are spikes."
 )
 
 
@@ -118,7 +120,9 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
                 place = f"world {w.world}, step {w.step}"
                 row = split_row_unit(w.where)[0]
                 rows.append([f"worst_{i}.npz", (place, "q", ""), (row, "text", "")])
-            command = f"lavender check {folder.parent / 'worst' / 'worst_1.npz'}"
+            command = shlex.join(
+                ["lavender", "check", str(folder.parent / "worst" / "worst_1.npz")]
+            )
             tables += [make_table(rows, title="Look at the worst steps"), {"code": command}]
         blocks.append({"pair": [[markupsafe.Markup(counts.draw_errors(folder))], tables]})
     sections = (
@@ -148,9 +152,8 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
         f"lavender audit · {model} · {audit.engine} · {runs.worlds} worlds × {runs.steps} steps"
     )
     code = []
-    if counts.above and audit.engine == "mujoco" and not audit.divergences:
-        states = audit.folder / "states.npz"
-        code = [f"lavender tune {model} --max-velocity-error {counts.limit:g} --states {states}"]
+    if counts.above and audit.engine == "mujoco" and not audit.divergences and runs.source:
+        code = [format_next_command(audit, counts.limit)]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
     files = "records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)"
     footer = [f"{starts}. Files: {files}."]
@@ -166,6 +169,16 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
         blocks=blocks,
         footer=footer,
     )
+
+
+def format_next_command(audit: Any, limit: float) -> str:
+    """Return the command that tunes the model of an audit as it was given, with the audit's controls."""
+    runs = audit.runs
+    words = ["lavender", "tune", runs.source, "--max-velocity-error", f"{limit:g}"]
+    words += ["--states", str(audit.folder / "states.npz")]
+    if runs.control_name not in ("", "random"):
+        words += ["--controls", runs.control_name]
+    return shlex.join(words)
 
 
 class AuditCounts:
@@ -194,6 +207,9 @@ class AuditCounts:
         self.world, self.step = map(int, np.unravel_index(place, self.sizes.shape))
         own = next((w for w in audit.worst if (w.world, w.step) == (self.world, self.step)), None)
         self.row, self.unit = split_row_unit("" if own is None else own.where)
+        # Unit of errors of several rows.
+        units = dict.fromkeys(split_row_unit(name)[1] for name in audit.where)
+        self.units = " or ".join(sorted(units)) or self.unit
 
     # -- sentences -----------------------------------------------------------------------------------------
 
@@ -201,7 +217,7 @@ class AuditCounts:
     def verdict(self) -> str:
         """The size of the error, with divergence first, and steps that were not judged."""
         audit = self.audit
-        limit = format_speed(self.limit)
+        limit = format_speed(self.limit, self.units)
         parts = []
         if audit.divergences:
             first = min(d.step for d in audit.divergences)
@@ -223,7 +239,7 @@ class AuditCounts:
             largest = format_speed(self.largest, self.unit, self.limit)
             by = f"by more than {largest}" if self.largest else "beyond rounding"
             parts.append(
-                f"no step is wrong {by}; the limit is {format_speed(self.limit, self.unit)}"
+                f"no step is wrong {by}; the limit is {format_speed(self.limit, self.units)}"
             )
         if lost := int((audit.verdict == len(VERDICTS)).sum()):
             parts.append(f"{format_count(lost, 'step')} not judged")
@@ -272,11 +288,17 @@ class AuditCounts:
         if not all(map(len, known)):
             return text
         early, late = (float(np.quantile(part, 0.99, method="higher")) for part in known)
-        falling = "Falling" if late < early / TREND_RATIO else "Steady"
-        trend = "Growing" if late > TREND_RATIO * early else falling
+        # Isolated spikes are no trend: a share of the steps has to exceed the other part's quantile by the factor.
+        shares = [
+            float(np.mean(part > TREND_RATIO * other))
+            for part, other in zip(known, (late, early), strict=True)
+        ]
+        trend = "Growing" if shares[1] >= MIN_TREND_SHARE else "Steady"
+        trend = "Falling" if shares[0] >= MIN_TREND_SHARE > shares[1] else trend
+        sizes = [format_speed(x, self.units) for x in (early, late)]
         return (
-            f"{text} {trend} with time: the error that 1 % of the steps exceed is {format_speed(early)} in steps "
-            f"{quarter} to {2 * quarter - 1} and {format_speed(late)} in the last {quarter}."
+            f"{text} {trend} with time: the error that 1 % of the steps exceed is {sizes[0]} in steps "
+            f"{quarter} to {2 * quarter - 1} and {sizes[1]} in the last {quarter}."
         )
 
     def _describe_cause(self) -> str:
@@ -306,8 +328,12 @@ class AuditCounts:
                 texts.append(f"Cause: the solver. {these} solves stopped before convergence.")
             n_wrong = 0 if own in OWN_CAUSES else int((self.is_above & wrong).sum())
             if n_wrong:
-                count = f"{format_count(n_wrong, 'answer')} of the engine {'is' if n_wrong == 1 else 'are'}"
-                texts.append(f"{count} no solution of its own problem.")
+                are = "answer of the engine is" if n_wrong == 1 else "answers of the engine are"
+                texts.append(
+                    f"{format_number(n_wrong)} {are} no solution of its own problem: the error is at least that of "
+                    "zero impulses, which no early stop explains. The state or the model may have changed within the "
+                    "step."
+                )
         elif n := int((stopped | wrong).sum()):
             count = f"{format_count(n, 'solve')} ({format_percent(n, self.n, 1)})"
             texts.append(f"{count} stopped before convergence, all within the limit.")
@@ -365,7 +391,7 @@ class AuditCounts:
                     axes.step(x, y, where="post", color=drawing.PINK, lw=1.0, ls=dash)
                     if y[-1] == y[-1]:
                         labels.append(drawing.Label(y[-1], f"against, {name}", drawing.PINK))
-            axes.set_ylabel("velocity error [m/s]")
+            axes.set_ylabel(f"velocity error [{self.units}]")
             drawing.label_ends(axes, labels)
             order = np.argsort(-np.nan_to_num(self.sizes).max(axis=1), kind="stable")
             rows = np.array_split(order, min(worlds, MAX_STRIP_WORLDS))
@@ -382,7 +408,7 @@ class AuditCounts:
             if self.largest:
                 style = {"ms": 6, "color": drawing.INK, "mfc": "none", "mew": 1.2, "clip_on": False}
                 strip.plot([self.step + 0.5], [max(worlds / 60.0, 0.5)], "v", **style)
-            ends = ", ".join(f"{name} {format_speed(y)}" for name, y in last.items())
+            ends = ", ".join(f"{name} {format_speed(y, self.units)}" for name, y in last.items())
             return f"Velocity error against step of {worlds} worlds; in the last steps: {ends}. {self.verdict}"
 
         note = (

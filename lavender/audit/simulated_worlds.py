@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -96,6 +97,9 @@ class Runs:
     notes: tuple[
         str, ...
     ] = ()  # Sentences about the differences from a simulation of the model as it is.
+    # Path of the model and value of --controls as they were given, for printed commands; empty if they were objects.
+    source: str = ""
+    control_name: str = ""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
@@ -129,7 +133,17 @@ class Runs:
         """
         mj, model = load_model(source)
         notes = (SLEEP_NOTE,) if can_sleep(mj, model) else ()
-        runs = cls(name_model(source), without_sleep(mj, model), worlds, steps, notes=notes, **more)
+        control = more.get("control", "random")
+        runs = cls(
+            name_model(source),
+            without_sleep(mj, model),
+            worlds,
+            steps,
+            notes=notes,
+            source=os.fspath(source) if isinstance(source, (str, os.PathLike)) else "",
+            control_name=os.fspath(control) if isinstance(control, (str, os.PathLike)) else "",
+            **more,
+        )
         make_controller(model, runs.control, runs.seed)
         if states is not None:
             starts = read_states(mj, runs.model, states)

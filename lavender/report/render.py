@@ -28,6 +28,7 @@ from lavender.report.text import NONE, escape_unprintable, format_sizes, format_
 if TYPE_CHECKING:
     from rich.console import Console
 
+MAX_PIPED_WIDTH = 120  # [columns] Largest width of a table in a file or pipe.
 MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
 MAX_WORD_WIDTH = (
     24  # [columns] A column of words becomes as narrow as its longest word, or as this width.
@@ -90,7 +91,7 @@ def escape_markdown(text: str) -> str:
 
 
 def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] = ()) -> None:
-    """Print a frame within the width of the terminal. Its texts are not read as markup.
+    """Print a frame within the width of the terminal, or `MAX_PIPED_WIDTH`. Its texts are not read as markup.
 
     Heads fold between words and numbers stay whole. In a table that is too wide, heads fold within words; then columns
     are left out and named: first `optional` in its order, then the last ones.
@@ -101,6 +102,7 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
     remaining = [head for head in optional if head in frame]
     left_out = list[str]()
     keeps_words = True
+    limit = console.width if console.is_terminal else min(console.width, MAX_PIPED_WIDTH)
     while True:
         texts = format_cells(frame)
         numbers = list_number_heads(texts)
@@ -123,7 +125,7 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
                 smallest = min(longest, MAX_WORD_WIDTH)
                 grid.add_column(Text(head), overflow="fold", min_width=smallest)
             width += smallest
-        if width <= console.width or (texts.shape[1] <= 2 and not keeps_words):
+        if width <= limit or (texts.shape[1] <= 2 and not keeps_words):
             break
         if keeps_words:
             keeps_words = False
@@ -132,7 +134,7 @@ def print_table(console: Console, frame: pd.DataFrame, optional: Sequence[str] =
             frame = frame.drop(columns=left_out[-1])
     for row in texts.to_numpy().tolist():
         grid.add_row(*map(Text, row), style="red" if any("✗" in text for text in row) else "")
-    console.print(grid, highlight=False)
+    console.print(grid, highlight=False, width=max(limit, width))
     if left_out and len(texts):
         console.print(
             f"not shown: {', '.join(left_out)}", style="dim", highlight=False, markup=False

@@ -73,7 +73,8 @@ def format_time(t: float) -> str:
 def format_speed(v: float, unit: str = "m/s", limit: float = math.nan) -> str:
     """Return a velocity error with two digits and a prefix of its unit: 0.23 mm/s; below 0.1 µm/s as a power of ten.
 
-    Beside another `limit` of the same text, the result has the digits that tell them apart: 1.004 mm/s.
+    Beside another `limit` of the same text, the result has the digits that tell them apart: 1.004 mm/s. Both units of
+    "m/s or rad/s" get the prefix.
     """
     if not math.isfinite(v):
         return NONE
@@ -85,7 +86,8 @@ def format_speed(v: float, unit: str = "m/s", limit: float = math.nan) -> str:
             while x != y and digits < 15 and f"{x:.{digits}g}" == f"{y:.{digits}g}":
                 digits += 1
             text = f"{x:.0f}" if x >= 9.95 and digits == 2 else f"{x:.{digits}g}"
-            return f"{text}\u00a0{prefix}{unit}"
+            units = " or ".join(f"{prefix}{one}" for one in unit.split(" or "))
+            return f"{text}\u00a0{units}"
     return f"{v:.0e}\u00a0{unit}".replace("e-0", "e-").replace("0e+00", "0")
 
 

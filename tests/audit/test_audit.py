@@ -2,7 +2,9 @@
 
 import io
 import itertools
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from rich.console import Console
 import lavender as lv
 from lavender.audit import audit as module
 from lavender.audit.audit import audit
+from lavender.audit.page import AuditCounts
 from lavender.audit.pieces import AUDIT_VERDICTS
+from lavender.audit.result import Audit
 from lavender.audit.simulated_worlds import Frame, Runs, iterate_frames
 from lavender.io.efc import from_efc
 
@@ -425,3 +429,51 @@ def test_next_velocity_of_an_engine_follows_from_its_judged_answer(engine, euler
                 predicted = problem.generalized.v_free + motion.change
             # Rounding of float32, to which the matrix of MJX adds its condition.
             np.testing.assert_allclose(after.state["qvel"][i], predicted, atol=2e-5)
+
+
+def test_isolated_spikes_are_no_trend():
+    """The quantile of 1 % of the last quarter is that of spikes; a trend needs 5 % of its steps."""
+
+    def describe(errors):
+        result = Audit.with_size(Runs("boxes", None, *errors.shape), "theirs")
+        result.numbers[0], result.verdict[:] = (
+            errors,
+            AUDIT_VERDICTS.index("stopped before convergence"),
+        )
+        return " ".join(AuditCounts(result).sentences)
+
+    quiet = np.full((12, 100), 1e-5)
+    spikes = quiet.copy()
+    spikes[np.arange(12), np.linspace(20, 99, 12).astype(int)] = 1e-1
+    spikes[0, 20] = 1.0
+    assert "Steady with time" in describe(spikes)
+    growing = quiet * np.exp(np.arange(100) / 10.0)
+    assert "Growing with time" in describe(growing) and "Falling with time" in describe(
+        growing[:, ::-1]
+    )
+
+
+def test_audit_prints_the_next_command_as_it_can_be_pasted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "my robots"
+    folder.mkdir()
+    (folder / "model.xml").write_text(BOXES.format(options='iterations="1" ls_iterations="2"'))
+    found = audit(
+        "my robots/model.xml",
+        worlds=2,
+        steps=20,
+        workers=1,
+        control="hold",
+        max_velocity_error=1e-9,
+    )
+    found.write("out dir")
+    (code,) = found.page.make_page(None).code
+    words = shlex.split(code)
+    assert words[:3] == ["lavender", "tune", "my robots/model.xml"]
+    assert words[words.index("--controls") + 1] == "hold"
+    assert Path(words[words.index("--states") + 1]).exists()
+    # A model in memory has no path that a command could name.
+    model = mj.MjModel.from_xml_path("my robots/model.xml")
+    own = audit(model, worlds=2, steps=20, workers=1, max_velocity_error=1e-9)
+    own.write("own")
+    assert not own.page.make_page(None).code

@@ -332,3 +332,47 @@ def test_tune_leaves_out_a_setting_that_ends_mujoco_in_an_error(boxes, monkeypat
     monkeypatch.setattr(Stage, "judge_setting", lambda self, *given: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)
+
+
+def test_setting_without_gain_on_the_worlds_held_back_is_not_recommended():
+    now = measured(1.0, 5e-4)
+    better = measured(0.9, 1e-5, iterations=5)
+    held = [measured(1.0, 5e-15), measured(1.0, 5e-15, iterations=5)]
+    tuning = chosen(now, better, held=held)
+    first, *_ = tuning.headline
+    assert tuning.closer is better or tuning.faster is better
+    assert tuning.advised is None and "has no gain on the worlds held back" in first
+    assert (
+        first.startswith("Keep the model's own setting: ") and not tuning.page.make_page(None).code
+    )
+    held[1] = measured(0.8, 5e-15, iterations=5)
+    assert chosen(now, better, held=held).advised is better
+
+
+def test_figure_of_settings_has_a_logarithmic_time_axis(tmp_path):
+    times = [1.0, 0.98, 1.02, 1.1, 1.2, 25.0]
+    some = [
+        measured(t, 10.0 ** -(i + 2), **({"iterations": i} if i else {}))
+        for i, t in enumerate(times)
+    ]
+    svg = chosen(*some).draw_settings(tmp_path)
+    assert all(f">{tick}<" in svg for tick in ("1", "1.1", "1.2", "10", "20"))
+
+
+def test_errors_of_hinges_are_in_rad_per_second(boxes):
+    """The limit of a joint is the only row: its velocity is angular."""
+    xml = """<mujoco><option iterations="1" ls_iterations="1"/><worldbody><body pos="0 0 1"><joint type="hinge"
+     axis="0 1 0" limited="true" range="-0.1 0.1"/><geom type="capsule" size=".05 .3" pos="0 0 -.3"/></body>
+     </worldbody></mujoco>"""
+    model = mj.MjModel.from_xml_string(xml)
+    data = mj.MjData(model)
+    data.qvel[:] = 3.0
+    states = []
+    for _ in range(40):
+        mj.mj_step(model, data)
+        state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+        mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+        states.append(state)
+    runs = Runs.of_model(model, 4, 10, states={"state": np.array(states)})
+    judged = Stage.from_stretches_of_runs(runs, range(4), 10).judge_setting(Setting())
+    assert judged.unit == "rad/s"

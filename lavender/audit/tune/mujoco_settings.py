@@ -36,6 +36,7 @@ from lavender.report.runner import Event
 MAX_TIME_RATIO = 1.25
 # The errors of every fourth stretch come first: they exclude most settings that are not accurate enough.
 MIN_JUDGED_PARTS = 4
+N_UNIT_STEPS = 3  # Steps of a part, those with the largest errors, whose rows decide the unit of a setting's error.
 ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error over all steps.
 
 
@@ -103,6 +104,9 @@ class Measured:
     times: FloatArray = field(repr=False)
     rows: Any = field(default=(), repr=False)  # (steps,) int
     contacts: Any = field(default=(), repr=False)  # (steps,) int
+    unit: str = (
+        "m/s"  # Unit of the largest errors: "m/s", "rad/s" or, of several rows, "m/s or rad/s".
+    )
 
     @property
     def mean_step_time(self) -> float:
@@ -199,13 +203,17 @@ class Stage:
         n_parts = max(MIN_JUDGED_PARTS, -(-len(states) // MAX_PROBLEMS_IN_MEMORY))
         part_of_steps = np.repeat(np.arange(n) % n_parts, horizon)
         judged = np.zeros(len(states), bool)
+        units = set[str]()
         try:
             ends = self.run_stretches(model, states)[1]
             for part in range(n_parts):
                 some = part_of_steps == part
                 batch, impulse = from_mujoco_many(judge, states[some], errors="status")
-                found = residual_many(batch, impulse, errors="status").velocity_error
-                error[some] = np.nan_to_num(found, nan=np.inf)
+                found = residual_many(batch, impulse, errors="status")
+                error[some] = np.nan_to_num(found.velocity_error, nan=np.inf)
+                for i in np.argsort(-error[some])[:N_UNIT_STEPS].tolist():
+                    if error[some][i] < np.inf and found.worst_row[i] >= 0:
+                        units.add(batch[i].row_unit(int(found.worst_row[i])))
                 rows[some], contacts[some] = batch.row_counts, batch.contact_counts
                 judged |= some
                 if error[some].max(initial=0.0) > limit:
@@ -216,7 +224,8 @@ class Stage:
         if np.isnan(distance).any():
             return result
         sizes: dict[str, Any] = {"rows": rows[judged], "contacts": contacts[judged]}
-        return replace(result, error=error[judged], motion=distance, **sizes)
+        unit = " or ".join(sorted(units)) or "m/s"
+        return replace(result, error=error[judged], motion=distance, unit=unit, **sizes)
 
     def judge_settings(
         self, settings: list[MujocoSetting], progress: Progress, limit: float = np.inf

@@ -21,6 +21,27 @@ from lavender.report.text import NONE, format_count, format_speed
 
 # Times that differ by at most this fraction count as equal: noise is a few per cent.
 TIME_NOISE_FRACTION = 0.05
+# Marks of the logarithmic axis of relative times.
+TIME_TICKS = (
+    0.1,
+    0.2,
+    0.3,
+    0.5,
+    0.7,
+    0.8,
+    0.9,
+    1.0,
+    1.1,
+    1.2,
+    1.5,
+    2.0,
+    3.0,
+    5.0,
+    10.0,
+    20.0,
+    50.0,
+    100.0,
+)
 CHOICES_NOTE = (
     "Chosen on the worlds with even numbers, tested on the others. On other states the errors can be larger. "
     + MERGE_NOTE
@@ -166,13 +187,26 @@ class Tuning:
             "contact may be neither with it. Start from states with contact (--states FILE), or take more --steps."
         )
 
+    def _has_gain_held_back(self, m: Measured) -> bool:
+        """Return whether a setting is faster or more accurate on the worlds held back, or was not measured there.
+
+        Errors up to the threshold count as equal.
+        """
+        held = next((h for h in self.held if h.setting == m.setting), None)
+        if held is None:
+            return True
+        now = self.held[0]
+        is_faster = held.mean_step_time < (1.0 - TIME_NOISE_FRACTION) * now.mean_step_time
+        errors = [max(float(x.error.max()), self.threshold) for x in (held, now)]
+        return is_faster or errors[0] < errors[1]
+
     def _format_held_back(self, m: Measured) -> tuple[str, str] | None:
         """Return the relative time and the worst error on the worlds held back; None if they were not measured."""
         held = next((h for h in self.held if h.setting == m.setting), None)
         if held is None:
             return None
         ratio = held.mean_step_time / self.held[0].mean_step_time
-        return f"{ratio:.2f}", format_speed(float(held.error.max()))
+        return f"{ratio:.2f}", format_speed(float(held.error.max()), held.unit)
 
     def _tabulate_settings(self, settings: Iterable[Measured]) -> pd.DataFrame:
         """Build the table of some settings."""
@@ -190,8 +224,8 @@ class Tuning:
         heads = [
             "setting",
             "relative time",
-            "error 99 % [m/s]",
-            "largest error [m/s]",
+            f"error 99 % [{self.present_result.unit}]",
+            f"largest error [{self.present_result.unit}]",
             "motion [m]",
         ]
         return pd.DataFrame(rows, columns=heads)
@@ -215,7 +249,8 @@ class Tuning:
             return None if self.limit_choice is now else self.limit_choice
         both = (self.closer, self.faster)
         first, second = both if now.error.max() > self.shown_limit else both[::-1]
-        return first or second
+        known = [m for m in (first, second) if m is not None]
+        return next((m for m in known if self._has_gain_held_back(m)), None)
 
     @property
     def headline(self) -> list[str]:
@@ -223,22 +258,29 @@ class Tuning:
         now = self.present_result
         m = self.advised
         n = len(self._same_problem)
-        worst = format_speed(self._compute_largest_error(now), limit=self.shown_limit)
+        worst = format_speed(self._compute_largest_error(now), now.unit, self.shown_limit)
+        quantile = format_speed(now.worst_error, now.unit)
         own = (
-            f"Now 1 % of the steps have errors above {format_speed(now.worst_error)}, the worst {worst}; the limit is "
-            f"{format_speed(self.shown_limit)}."
+            f"Now 1 % of the steps have errors above {quantile}, the worst {worst}; the limit is "
+            f"{format_speed(self.shown_limit, now.unit)}."
         )
         if self.reason_without_line:
             return [self.reason_without_line, own]
         if m is None:
-            return [
-                f"Keep the model's own setting: none of {n} settings is better in the same time.",
-                own,
-            ]
+            keep = "Keep the model's own setting"
+            lost = self.closer or self.faster
+            if self.error_limit is None and lost is not None:
+                time, error = self._format_held_back(lost) or (NONE, NONE)
+                gain = f"{time} of the time, worst error {error}"
+                return [
+                    f"{keep}: {lost.setting.short_name} has no gain on the worlds held back ({gain}).",
+                    own,
+                ]
+            return [f"{keep}: none of {n} settings is better in the same time.", own]
         ratio = m.mean_step_time / now.mean_step_time
         is_same = abs(ratio - 1.0) <= TIME_NOISE_FRACTION
         time = "the same time per step" if is_same else f"{ratio:.2f} of the time per step"
-        new, old = (format_speed(self._compute_largest_error(x)) for x in (m, now))
+        new, old = (format_speed(self._compute_largest_error(x), x.unit) for x in (m, now))
         worst = (
             f"a worst error of {new} instead of {old}"
             if new != old
@@ -279,10 +321,9 @@ class Tuning:
                 continue
             texts = self._format_held_back(m) or (NONE, NONE)
             time = f"{m.mean_step_time / now.mean_step_time:.2f}"
-            worst = format_speed(self._compute_largest_error(m))
-            rows.append(
-                (name, m.setting.short_name, time, format_speed(m.worst_error), worst, *texts)
-            )
+            worst = format_speed(self._compute_largest_error(m), m.unit)
+            quantile = format_speed(m.worst_error, m.unit)
+            rows.append((name, m.setting.short_name, time, quantile, worst, *texts))
         heads = ["choice", "option", "time", "1 %", "worst", "time, held back", "worst, held back"]
         return pd.DataFrame(rows, columns=heads)
 
@@ -304,18 +345,24 @@ class Tuning:
             points = np.array(list(map(place, self._same_problem)))
             labels = drawing.mark_errors(axes, low, float(points[:, 1].max()), limit)
             low_x = float(points[:, 0].min())
-            high_x = max(float(np.quantile(points[:, 0], 0.97)), 1.05)
-            axes.set_xlim(low_x - 0.04, high_x + 0.04)
+            high_x = max(float(points[:, 0].max()), 1.05)
+            axes.set_xscale("log")
+            axes.set_xlim(low_x / 1.05, high_x * 1.05)
+            ticks = [x for x in TIME_TICKS if low_x / 1.05 <= x <= high_x * 1.05]
+            axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+            axes.minorticks_off()
             axes.axvline(1.0, color=drawing.QUIET, lw=0.7, ls=":")
             for solver, (color, mark) in styles.items():
                 own = np.array([place(m) for m in self._same_problem if m.solver == solver])
                 axes.plot(*own.T, mark, color=color, ms=4.5, alpha=0.75, mew=0)
             front = np.array(list(map(place, self.pareto_front)))
-            axes.step(*front.T, where="post", color=drawing.QUIET, lw=0.8, zorder=1)
+            # From each setting of the front to the right, nothing slower is needed for its error.
+            front = np.vstack([front, [high_x * 1.05, front[-1, 1]]])
+            axes.step(*front.T, where="post", color=drawing.INK, lw=1.6, zorder=2)
             x, y = place(now)
             axes.plot([x], [y], "*", ms=14, color=drawing.INK, mec=drawing.PAPER, mew=0.8, zorder=9)
             more = {"textcoords": "offset points", "fontweight": "bold", "fontsize": 8.8}
-            is_left = x < np.mean(axes.get_xlim())
+            is_left = x < np.sqrt(np.prod(axes.get_xlim()))
             side, dx = ("left", 8) if is_left else ("right", -8)
             axes.annotate("your option", (x, y), xytext=(dx, 8), ha=side, **more)
             if self.advised is not None:
@@ -324,7 +371,7 @@ class Tuning:
                 axes.plot([x], [y], "o", ms=10, mfc="none", mec=drawing.INK, mew=1.4, zorder=9)
                 axes.annotate("set this", (x, y), xytext=(14, 26), arrowprops=arrow, **more)
             axes.set_xlabel("time of a step, your option = 1")
-            axes.set_ylabel("error that 1 % of the steps exceed [m/s]")
+            axes.set_ylabel(f"error that 1 % of the steps exceed [{now.unit}]")
             drawing.label_ends(axes, labels)
             for i, (solver, (color, mark)) in enumerate(styles.items()):
                 y = 0.97 - 0.07 * i
