@@ -101,6 +101,7 @@ SPEC = replace(
     pgs.SPEC,
     name="sequential_impulses",
     factory=SequentialImpulses,
+    options={},
     operators=frozenset({"rows"}),
     summary="projected Gauss-Seidel on body velocities, matrix-free",
     reference="Catto 2005, Iterative Dynamics with Temporal Coherence; Guendelman, Bridson, Fedkiw 2003",

@@ -54,7 +54,7 @@ SPEC = replace(
     box_friction_laws=frozenset(),
     operators=frozenset({"matrix"}),
     supports_rolling=False,
-    bounded_hint=": 'pgs' is this method with bounds, at omega = 1",
+    bounded_hint=": 'pgs' with omega= is this method with bounds (PSOR)",
     options={"omega": "relaxation factor, 0 < omega < 2; default 1.5"},
     summary="successive over-relaxation of a linear system",
     reference="Young 1971, Iterative Solution of Large Linear Systems",

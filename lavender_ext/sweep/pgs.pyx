@@ -43,8 +43,7 @@ cdef inline void relax_rows_block(const blocks_t* p, const row_form_t* form, int
     if has_independent_rows(p, i):
         for row in range(first, p.ptr[i + 1]):
             impulse[0] = lam[row] - compute_row_slack(form, p, panel, row, lam, v) * get_row_step(form, p, row)
-            if row_form_t is not damped_csr_t:          # SOR runs on free rows only, which have no bounds.
-                impulse[0] = clip(impulse[0], p.lower[row], p.upper[row])
+            impulse[0] = clip(impulse[0], p.lower[row], p.upper[row])
             set_row_impulse(form, panel, row, impulse[0], lam, v)
         return
     # Update the normal.
@@ -95,7 +94,7 @@ cdef void sweep_bounded_rows(const blocks_t* p, const csr_t* a, double* lam) noe
 
 
 cdef void sweep_matrix_sor(const blocks_t* p, const csr_t* a, double omega, const int32_t* order, double* lam) noexcept nogil:
-    """Sweep over A with steps multiplied by omega (successive over-relaxation)."""
+    """Sweep over A with steps multiplied by omega (successive over-relaxation, projected on the bounds and cones)."""
     cdef damped_csr_t form = damped_csr_t(a, omega)
     sweep_blocks(p, &form, order, p.n_blocks, lam, NULL)
 

@@ -4,7 +4,7 @@
     sequential impulses   (1) with w = J v + c lam - b, v = M^-1 J^T lam; A is never formed            (2)
     block gauss seidel    (1) or (2) with each block solved exactly (local/gauss_seidel.pyx)
     jacobi                all blocks with the w of before the sweep, and steps multiplied by omega     (3)
-    sor                   lam_i <- lam_i - omega w_i / d_i on free rows                                (4)
+    sor                   (1) with steps multiplied by omega, over A; on bounded rows and cones it is projected     (4)
 
 Over J and M the sweeps of (1) use u = Y^T lam: w = Y u + c lam - b. All methods use the update of a block of core/block.pxd
 (1)-(3). Invariant of (2), on entry and after every block: v = M^-1 J^T lam to rounding.

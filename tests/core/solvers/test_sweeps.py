@@ -133,3 +133,64 @@ def test_the_order_of_a_sweep_is_in_the_solution_and_its_text(name):
         solution = lv.solve(problem, name, order=order, max_iter=3)
         assert solution.solver.order == words and f", order {words}" in str(solution)
     assert lv.solve(problem, name, max_iter=3).solver.order == "given"
+
+
+# -- projected successive over-relaxation ------------------------------------------------------------------
+
+
+def run_psor(problem, omega, n):
+    """Return lambda after n sweeps of PSOR in NumPy, row after row (Cryer 1971)."""
+    A = problem.dense()
+    x = problem.start().copy()
+    for _ in range(n):
+        for i in range(problem.m):
+            step = omega * (A[i] @ x - problem.b[i]) / A[i, i]
+            x[i] = np.clip(x[i] - step, problem.cones.lower[i], problem.cones.upper[i])
+    return x
+
+
+@pytest.mark.parametrize("omega", [0.3, 1.2, 1.9])
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_pgs_with_omega_is_projected_sor(omega, form):
+    rng = np.random.default_rng(1)
+    J = rng.normal(size=(9, 12))
+    cones = lv.Cones.bounded(-rng.random(9), rng.random(9))
+    problem = lv.Problem.from_jacobian(J, np.eye(12), rng.normal(size=12), cones=cones)
+    if form == "matrix":
+        problem = lv.Problem(problem.b, cones, J @ J.T)
+    found = lv.solve(problem, "pgs", omega=omega, tol=0.0, max_iter=7)
+    # Rounding of sums of nine terms of size one.
+    np.testing.assert_allclose(found.impulse, run_psor(problem, omega, 7), rtol=0.0, atol=1e-13)
+    assert lv.solve(problem, "pgs", omega=omega, tol=1e-9, max_iter=20_000).success
+
+
+def test_pgs_with_omega_one_has_the_bits_of_pgs_and_other_values_are_refused():
+    problem = lv.suite.case("granular(n=3)").problem
+    for omega in (1.0, 1):
+        pair = [lv.solve(problem, "pgs", **more) for more in ({}, {"omega": omega})]
+        assert pair[0].impulse.tobytes() == pair[1].impulse.tobytes()
+        assert pair[0].iterations == pair[1].iterations
+    for omega in (0.0, 2.0, -1.0):
+        with pytest.raises(lv.InputError, match="omega is"):
+            lv.solve(problem, "pgs", omega=omega)
+
+
+def test_rate_of_pgs_with_the_best_omega_is_that_of_young():
+    """On a chain, Gauss-Seidel multiplies the error by rho^2 and SOR at its best omega by omega - 1."""
+    n = 30
+    A = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    problem = lv.Problem.lcp(A, np.random.default_rng(0).random(n))  # No row ends at its bound.
+    rho = np.cos(np.pi / (n + 1))
+    best = 2.0 / (1.0 + np.sqrt(1.0 - rho * rho))
+    found = {w: lv.solve(problem, "pgs", omega=w, tol=1e-8, max_iter=20_000) for w in (1.0, best)}
+    assert all(s.success and (s.impulse > 0.0).all() for s in found.values())
+    for omega, rate in ((1.0, rho * rho), (best, best - 1.0)):
+        sweeps = np.log(1e-8) / np.log(rate)
+        # Twice for the polynomial factor of the double eigenvalue at the best omega, and for the checks.
+        assert 0.5 * sweeps < found[omega].iterations < 2.0 * sweeps
+
+
+@pytest.mark.parametrize("omega", [0.5, 1.5])
+def test_pgs_with_omega_solves_contacts_with_friction(omega):
+    problem = lv.suite.case("box_stackF(n=3)").problem
+    assert lv.solve(problem, "pgs", omega=omega, tol=1e-6, max_iter=100_000).success
