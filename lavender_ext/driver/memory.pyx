@@ -8,8 +8,8 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_CACHE_IMPULSE,
-                                         N_JOINT, N_SIZES, ROWS_PER_CONTACT, S_OUT, bind_engine_arrays, engine_t)
+from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID, N_INDEX_ARRAYS,
+                                         N_KEY_ARRAYS, N_REAL_ARRAYS, N_SIZES, S_OUT, bind_engine_arrays, engine_t)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -46,23 +46,28 @@ cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, in
 
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys, const int32_t* to_size,
                                  double* to_real, int32_t* to_index, uint64_t* to_keys) noexcept nogil:
-    """Copy the state that is carried between substeps, without scratch, to larger, zero-initialised buffers."""
+    """Copy the state to larger, zero-initialised buffers; the list of pairs is built again."""
     cdef engine_t a, b
     cdef int64_t used[3]
-    cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
-    bind_engine_arrays(size, real, index, keys, &a, used)
+    cdef double** real_of = &a.setting
+    cdef double** to_real_of = &b.setting
+    cdef int32_t** index_of = &a.head
+    cdef int32_t** to_index_of = &b.head
+    cdef uint64_t** keys_of = &a.key
+    cdef uint64_t** to_keys_of = &b.key
+    cdef int32_t k
     bind_engine_arrays(to_size, to_real, to_index, to_keys, &b, used)
-    # Copy consecutive arrays together if their sizes do not depend on the capacities.
-    memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
-    memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
-    memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
-    memcpy(b.cache_impulse, a.cache_impulse, N_CACHE_IMPULSE * c * sizeof(double))
-    memcpy(b.cache_local, a.cache_local, 6 * c * sizeof(double))
-    memcpy(b.cache_roll, a.cache_roll, (3 * c if size[ROWS_PER_CONTACT] > 4 else 0) * sizeof(double))
-    memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
-    memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
-    memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
-    memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
+    bind_engine_arrays(size, real, index, keys, &a, used)
+    # An array ends where the next one begins.
+    for k in range(N_REAL_ARRAYS):
+        memcpy(to_real_of[k], real_of[k],
+               ((real_of[k + 1] if k + 1 < N_REAL_ARRAYS else real + used[0]) - real_of[k]) * sizeof(double))
+    for k in range(N_INDEX_ARRAYS):
+        memcpy(to_index_of[k], index_of[k],
+               ((index_of[k + 1] if k + 1 < N_INDEX_ARRAYS else index + used[1]) - index_of[k]) * sizeof(int32_t))
+    for k in range(N_KEY_ARRAYS):
+        memcpy(to_keys_of[k], keys_of[k],
+               ((keys_of[k + 1] if k + 1 < N_KEY_ARRAYS else keys + used[2]) - keys_of[k]) * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 
 

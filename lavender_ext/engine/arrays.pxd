@@ -48,6 +48,9 @@ cpdef enum:
     H_LOST = 16             # first body with a state that is not finite, or -1
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     H_FRICTION_SHAPE = 18   # 1: each tangent is bounded separately (box friction)
+    H_SUBSTEPS = 19         # substeps of a step
+    H_PHASE = 20            # substeps that the present step has done; 0: the next one builds all contacts anew
+    H_REBUILT = 21          # 1: the last substep built contacts anew; 0: it kept the rows of the substep before
     N_HEAD = 24
 
 # H_ORDER: sweep order of the blocks; joints and contacts are ordered separately
@@ -118,8 +121,8 @@ cpdef enum:
 
 # arrays in each buffer
 cdef enum:
-    N_REAL_ARRAYS = 47
-    N_INDEX_ARRAYS = 22
+    N_REAL_ARRAYS = 48
+    N_INDEX_ARRAYS = 23
     N_KEY_ARRAYS = 3
 
 # entries of a cached contact impulse: normal, friction as a world vector (3), spin
@@ -177,6 +180,7 @@ cdef struct engine_t:
     double* patch_radius    # (kj + c) m
     double* rolling         # (kj + c) m, absent without rolling friction
     double* cache_roll      # (c, 3) N m s, world; absent without rolling friction
+    double* moved           # (n) m, path of the surface of a body since its contacts were built
     # The buffer of int32, in order: `lav_engine_offsets` iterates over these fields.
     int32_t* head           # (N_HEAD)
     int32_t* kind_of_shape  # (n)
@@ -200,6 +204,7 @@ cdef struct engine_t:
     int32_t* kind           # (kj + c)
     int32_t* order          # (kj + c) sweep order of the blocks
     int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, level of each block, sorting scratch
+    int32_t* due            # (n) 1 if the contacts of a body are built anew in the next substep
     # The buffer of uint64, in order: `lav_engine_offsets` iterates over these fields.
     uint64_t* key           # (c)
     uint64_t* cache_key     # (c)
@@ -263,6 +268,7 @@ cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* 
     e.patch_radius = take_doubles(&a, k)
     e.rolling = take_doubles(&a, k * rolls)
     e.cache_roll = take_doubles(&a, 3 * c * rolls)
+    e.moved = take_doubles(&a, n)
     e.head = take_integers(&a, N_HEAD)
     e.kind_of_shape = take_integers(&a, n)
     e.dyn = take_integers(&a, n)
@@ -285,6 +291,7 @@ cdef inline void bind_engine_arrays(const int32_t* size, double* real, int32_t* 
     e.kind = take_integers(&a, k)
     e.order = take_integers(&a, k)
     e.order_scratch = take_integers(&a, 2 * (n + k) + 8)
+    e.due = take_integers(&a, n)
     e.key = keys
     e.cache_key = keys + c
     e.color_scratch = keys + 2 * c

@@ -15,7 +15,8 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.validate cimport find_invalid_number
-from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
+from lavender_ext.engine.arrays cimport (H_PHASE, N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H,
+                                         engine_t)
 from lavender_ext.core.vectors cimport copy3, add_scaled3, matvec3
 
 
@@ -104,7 +105,10 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
 
 
 cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
-    """Compute frames, world inverse inertia and v* = v + h g of the coming substep."""
+    """Compute frames, world inverse inertia and v* = v + h g of the coming substep.
+
+    A body whose contacts keep their rows keeps its inverse inertia, so that A = J M^-1 J^T has one M.
+    """
     cdef int32_t i, b
     cdef double h = e.setting[S_H]
     cdef const double* g = e.setting + S_GRAVITY
@@ -113,7 +117,7 @@ cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
             compute_rotation_matrix(e.q + 4 * i, e.rot + 9 * i)
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
-        if e.uneven[b]:
+        if e.uneven[b] and (e.head[H_PHASE] == 0 or e.due[b]):
             rotate_tensor_to_world(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
         add_scaled3(e.v + 6 * b, h, g, e.v_free + 6 * i)
         copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)

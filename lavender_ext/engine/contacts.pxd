@@ -16,8 +16,18 @@ loaded contact has the same slop above the surface as below, and returns at the 
 
 Combined: mu = sqrt(mu_a mu_b), e = max, patch radius = min.
 
-Contacts are built pair by pair. Under the alternating order, every second substep runs from the last point of the last pair to
-the first: a sweep in one direction leaves its error on one side of a face, and the next sweep on the other.
+Contacts are built pair by pair in the first substep of a step. In the later substeps a contact keeps its points, normal and rows
+while its bodies move little, and its gap follows to first order the displacement s of the bodies,
+
+    g <- g + (J s)_n,   moved <- moved + |s_linear| + r |s_angular|,  r the radius of the body    (5)
+
+A body is *due* if (5), with as much again for the coming substep, exceeds half the margin or r/100: its pairs are then built anew.
+So the bodies of a pair that is kept come closer by at most the margin, the normal turns by at most 0.02 rad, and the neglected
+term of second order is at most r/20000 for each body. Bodies of joints are always due, because their rows follow each pose.
+
+Under the alternating order, the sweeps of every second substep run from the last point of the last pair to the first: a sweep in
+one direction leaves its error on one side of a face, and the next sweep on the other. The first substep of a step builds its
+contacts in the order of its sweeps.
 
 The cache holds key, impulse and arms of the last substep's contacts, sorted by pair like the pair list.
 A contact reuses the impulse of the entry with the same key if its point is within the match distance in the
@@ -27,17 +37,20 @@ no key has matched. A stale entry is not used; the sweeps correct a wrong match.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.block_types cimport choose_contact_kind
+from lavender_ext.core.block_types cimport (CONTACT, blocks_t, choose_contact_kind, count_angular_rows,
+                                              count_tangent_rows)
 from lavender_ext.core.steps cimport finish_pair
 from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3,
                                      largest_eigenvalue_2x2, reciprocal_or_zero, compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_WARM_START,
-                                         N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,
+                                         H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_PHASE, H_REBUILT, H_STEP,
+                                         H_WARM_START, NO_SHAPE, N_BODY, N_CACHE_IMPULSE, N_DYNAMIC, N_JOINT,
+                                         N_JOINT_ROW, ROWS_PER_CONTACT,
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_body
 from lavender_ext.engine.narrow_phase cimport collide_bodies, manifold_t
+from lavender_ext.engine.projection cimport contact_normal_velocity
 from lavender_ext.core.vectors cimport linear_combination3, copy3, subtract3
 
 
@@ -218,73 +231,301 @@ cdef inline void set_contact_target(engine_t* e, int32_t c, int32_t row, int32_t
 
 
 cdef inline int32_t is_contact_order_reversed(const engine_t* e) noexcept nogil:
-    """Return whether this substep builds its contacts from the last pair to the first."""
-    return e.head[H_ORDER] == ALTERNATING and e.head[H_STEP] & 1
+    """Return whether the contacts of this step were built from the last pair to the first."""
+    return e.head[H_ORDER] == ALTERNATING and (e.head[H_STEP] - e.head[H_PHASE]) & 1
+
+
+cdef struct pair_properties_t:      # what the contacts of a pair have in common
+    double mu                       # -
+    double patch                    # m
+    double bounce                   # -
+    int32_t n_tangents
+    int32_t n_angular               # bit 0: a spin row, bit 1: two rolling rows
+
+
+cdef inline pair_properties_t combine_materials(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
+    """Return the properties of the contacts of bodies a and b."""
+    cdef pair_properties_t out
+    out.mu = sqrt(e.friction[a] * e.friction[b])
+    out.bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+    out.patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
+    out.n_tangents = 2 if out.mu > 0.0 else 0
+    out.n_angular = 0
+    if out.mu > 0.0:
+        out.n_angular = (1 if out.patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
+    return out
+
+
+cdef inline int32_t count_contact_rows(const pair_properties_t* x) noexcept nogil:
+    """Return the number of rows of a contact."""
+    return 1 + x.n_tangents + (x.n_angular & 1) + (x.n_angular & 2)
+
+
+cdef inline int32_t add_contacts_of_pair(engine_t* e, const rows_t* r, int32_t a, int32_t b, const manifold_t* m, int32_t c,
+                                         int32_t row, int32_t* first) noexcept nogil:
+    """Build contacts c .. c + m.n - 1 of a pair from `row` on, warm-started from the cache; return how many were matched.
+
+    `first` is the cache entry at which the search for the pair begins.
+    """
+    cdef pair_properties_t x = combine_materials(e, a, b)
+    cdef double tangent[3]
+    cdef int32_t entry[4]
+    cdef int32_t j, k, block, matches = 0, start = c, cached = e.head[H_CACHED], last_first = is_contact_order_reversed(e)
+    cdef int32_t box = x.n_tangents > 0 and e.head[H_FRICTION_SHAPE], n_rows = count_contact_rows(&x)
+    cdef uint64_t pair = make_contact_key(a, b, 0)
+    if x.n_tangents > 0:
+        compute_tangent(m.normal, tangent)
+    for j in range(m.n):
+        build_contact(e, r, c, row, a, b, m, m.n - 1 - j if last_first else j, tangent, x.n_tangents, x.n_angular)
+        block = e.size[N_JOINT] + c
+        e.kind[block] = choose_contact_kind(box, x.n_angular & 1, x.n_angular & 2, x.n_tangents)
+        e.mu[block] = x.mu
+        e.patch_radius[block] = 1.0 if box else x.patch if x.n_angular & 1 else 0.0
+        if e.size[ROWS_PER_CONTACT] > 4:
+            e.rolling[block] = e.setting[S_ROLLING] if x.n_angular & 2 else 0.0
+        for k in range(n_rows):
+            e.impulse[row + k] = 0.0
+        row += n_rows
+        c += 1
+        e.ptr[block + 1] = row
+    # first cache entry of this pair, or its insertion position
+    while first[0] < cached and e.cache_key[first[0]] < pair:
+        first[0] += 1
+    while first[0] > 0 and e.cache_key[first[0] - 1] >= pair:
+        first[0] -= 1
+    if e.head[H_WARM_START] and first[0] < cached:
+        match_contacts_of_pair_to_cache(e, start, m.n, first[0], entry)
+        for j in range(m.n):
+            if entry[j] >= 0:
+                k = e.ptr[e.size[N_JOINT] + start + j]
+                warm_start_contact(e, start + j, entry[j], x.n_tangents, x.n_angular, e.impulse + k)
+                matches += 1
+    for j in range(start, c):
+        set_contact_target(e, j, e.ptr[e.size[N_JOINT] + j], a, b, x.bounce)
+    return matches
 
 
 cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     """Build all contacts of the pair list, warm-started from the cache, and return their number."""
     cdef manifold_t m
-    cdef double tangent[3]
-    cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, n_angular, box, start, c = 0, row = e.size[N_JOINT_ROW], block
-    cdef int32_t matches = 0, last_first = is_contact_order_reversed(e), cached = e.head[H_CACHED]
-    cdef int32_t first = cached if last_first else 0
-    cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
-    cdef uint64_t pair
+    cdef int32_t i, k, a, b, c = 0, row = e.size[N_JOINT_ROW], matches = 0, last_first = is_contact_order_reversed(e)
+    cdef int32_t first = e.head[H_CACHED] if last_first else 0
+    e.head[H_REBUILT] = 1
+    for i in range(e.size[N_BODY]):
+        e.moved[i] = 0.0
+        e.due[i] = 0
     e.ptr[e.size[N_JOINT]] = row
     for i in range(e.head[H_PAIRS]):
         k = e.head[H_PAIRS] - 1 - i if last_first else i
         a = e.pair[2 * k]
         b = e.pair[2 * k + 1]
-        collide_bodies(e, a, b, margin, &m)
+        collide_bodies(e, a, b, e.setting[S_MARGIN], &m)
         if m.n == 0:
             continue
-        if c + m.n > e.size[CAP_CONTACT]:
-            c += m.n                                    # Only count contacts beyond the capacity.
-            continue
-        mu = sqrt(e.friction[a] * e.friction[b])
-        bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
-        patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
-        nt = 2 if mu > 0.0 else 0
-        n_angular = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
-        if nt > 0:
-            compute_tangent(m.normal, tangent)
-        pair = make_contact_key(a, b, 0)
-        # first cache entry of this pair, or its insertion position
-        while first < cached and e.cache_key[first] < pair:
-            first += 1
-        while first > 0 and e.cache_key[first - 1] >= pair:
-            first -= 1
-        start = c
-        for j in range(m.n):
-            build_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, n_angular)
-            block = e.size[N_JOINT] + c
-            box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = choose_contact_kind(box, n_angular & 1, n_angular & 2, nt)
-            e.mu[block] = mu
-            e.patch_radius[block] = 1.0 if box else patch if n_angular & 1 else 0.0
-            if e.size[ROWS_PER_CONTACT] > 4:
-                e.rolling[block] = e.setting[S_ROLLING] if n_angular & 2 else 0.0
-            for k in range(1 + nt + n_angular):
-                e.impulse[row + k] = 0.0
-            row += 1 + nt + n_angular
-            c += 1
-            e.ptr[block + 1] = row
-        if e.head[H_WARM_START] and first < cached:
-            match_contacts_of_pair_to_cache(e, start, m.n, first, entry)
-            for j in range(m.n):
-                if entry[j] >= 0:
-                    k = e.ptr[e.size[N_JOINT] + start + j]
-                    warm_start_contact(e, start + j, entry[j], nt, n_angular, e.impulse + k)
-                    matches += 1
-        for j in range(start, c):
-            set_contact_target(e, j, e.ptr[e.size[N_JOINT] + j], a, b, bounce)
+        if c + m.n <= e.size[CAP_CONTACT]:
+            matches += add_contacts_of_pair(e, r, a, b, &m, c, row, &first)
+            row = e.ptr[e.size[N_JOINT] + c + m.n]
+        c += m.n                                        # Only count contacts beyond the capacity.
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c
         e.head[H_CONTACT_ROWS] = row - e.size[N_JOINT_ROW]
         e.head[H_MATCHES] = matches
     return c
+
+
+cdef inline int32_t follow_gaps(engine_t* e, int32_t shifted) noexcept nogil:
+    """Move the gaps of all contacts by (5) after the bodies have moved, and return whether a body is due."""
+    cdef int32_t i, k, b, c, any_due = 0
+    cdef double h = e.setting[S_H], step, radius, limit
+    cdef double* s
+    cdef const double* size
+    for i in range(e.size[N_DYNAMIC]):
+        b = e.body_of[i]
+        s = e.shift + 6 * i
+        for k in range(6):
+            s[k] = h * (e.v_free[6 * i + k] + e.dv[6 * i + k]) + (s[k] if shifted else 0.0)
+        if e.kind_of_shape[b] == NO_SHAPE:
+            continue
+        size = e.shape + 4 * b
+        radius = sqrt(dot3(size, size)) if e.kind_of_shape[b] == BOX else size[0]
+        step = sqrt(dot3(s, s))
+        if e.kind_of_shape[b] == BOX or e.uneven[b]:    # The surface of a sphere stays where it is when it turns.
+            step += radius * sqrt(dot3(s + 3, s + 3))
+        limit = min(0.5 * e.setting[S_MARGIN], 0.01 * radius)
+        e.moved[b] += step
+        e.due[b] = not e.moved[b] + step <= limit
+    for i in range(2 * e.size[N_JOINT]):
+        b = e.joint_bodies[i]
+        if b >= 0 and e.kind_of_shape[b] != NO_SHAPE:
+            e.due[b] = e.dyn[b] >= 0
+    for i in range(e.size[N_BODY]):
+        any_due |= e.due[i]
+    for c in range(e.head[H_CONTACTS]):
+        e.gap[c] += contact_normal_velocity(e, e.shift, c)
+    return any_due
+
+
+cdef inline void move_doubles(double* x, int32_t n, int32_t source, int32_t goal) noexcept nogil:
+    """Copy entry `source` of x (., n) to entry `goal`."""
+    cdef int32_t k
+    for k in range(n):
+        x[n * goal + k] = x[n * source + k]
+
+
+cdef inline void move_contact(engine_t* e, int32_t source, int32_t goal) noexcept nogil:
+    """Copy what belongs to a contact, except for its rows."""
+    cdef int32_t kj = e.size[N_JOINT], k
+    for k in range(2):
+        e.contact_pair[2 * goal + k] = e.contact_pair[2 * source + k]
+        e.contact_body[2 * goal + k] = e.contact_body[2 * source + k]
+    e.key[goal] = e.key[source]
+    e.kind[kj + goal] = e.kind[kj + source]
+    move_doubles(e.gap, 1, source, goal)
+    move_doubles(e.point, 3, source, goal)
+    move_doubles(e.normal, 3, source, goal)
+    move_doubles(e.arm_a, 3, source, goal)
+    move_doubles(e.arm_b, 3, source, goal)
+    move_doubles(e.local, 6, source, goal)
+    move_doubles(e.mu + kj, 1, source, goal)
+    move_doubles(e.patch_radius + kj, 1, source, goal)
+    if e.size[ROWS_PER_CONTACT] > 1:
+        move_doubles(e.tangent, 3, source, goal)
+        move_doubles(e.coupling, 5, source, goal)
+    if e.size[ROWS_PER_CONTACT] > 4:
+        move_doubles(e.rolling + kj, 1, source, goal)
+
+
+cdef inline void move_contact_rows(engine_t* e, int32_t n, int32_t source, int32_t goal) noexcept nogil:
+    """Copy n rows, from row `source` to row `goal`; if these overlap, forwards to a lower row, backwards to a higher one."""
+    cdef int32_t i, k, mj = e.size[N_JOINT_ROW]
+    for i in range(n):
+        k = i if goal < source else n - 1 - i
+        move_doubles(e.inv_inertia_arm, 6, source + k - mj, goal + k - mj)
+        move_doubles(e.d, 1, source + k, goal + k)
+        move_doubles(e.step, 1, source + k, goal + k)
+        move_doubles(e.impulse, 1, source + k, goal + k)
+
+
+cdef inline void refresh_contact(engine_t* e, const blocks_t* p, const rows_t* r, int32_t c) noexcept nogil:
+    """Write the right-hand side of a kept contact for the present velocities, gap and impulse."""
+    cdef double w[6]
+    cdef int32_t block = e.size[N_JOINT] + c, row = e.ptr[block], k, n = e.ptr[block + 1] - row
+    cdef int32_t a = e.contact_pair[2 * c], b = e.contact_pair[2 * c + 1]
+    if n == 3 and e.kind[block] == CONTACT:             # The common kind has constant sizes, so that loops are unrolled.
+        compute_contact_velocity(r, c, 2, 0, e.v_free, w)
+    else:
+        compute_contact_velocity(r, c, count_tangent_rows(p, block), count_angular_rows(p, block), e.v_free, w)
+    for k in range(n):
+        e.target[row + k] = 0.0
+        e.b[row + k] = 0.0 - w[k]
+        if not e.head[H_WARM_START]:
+            e.impulse[row + k] = 0.0
+    set_contact_target(e, c, row, a, b, e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b])
+
+
+cdef inline int32_t plan_kept_contacts(engine_t* e, int32_t* source, int32_t* new_row, int32_t* n_rows) noexcept nogil:
+    """Find where the contacts of this substep come from, and return their number; nothing is changed.
+
+    source (cap) receives the present number of a kept contact, -1 for a new one, and new_row (cap) the first row.
+    """
+    cdef manifold_t m
+    cdef pair_properties_t x
+    cdef int32_t i, j, k, a, b, n, renewed, c = 0, row = e.size[N_JOINT_ROW], old = 0
+    cdef int32_t last_first = is_contact_order_reversed(e)
+    cdef uint64_t pair, own
+    for i in range(e.head[H_PAIRS]):
+        k = e.head[H_PAIRS] - 1 - i if last_first else i
+        a = e.pair[2 * k]
+        b = e.pair[2 * k + 1]
+        pair = make_contact_key(a, b, 0) >> 16
+        # the pair's contacts so far; a pair that has left the list loses its contacts
+        n = 0
+        while old + n < e.head[H_CONTACTS]:
+            own = e.key[old + n] >> 16
+            if own == pair:
+                n += 1
+            elif n == 0 and (own > pair if last_first else own < pair):
+                old += 1
+            else:
+                break
+        renewed = e.due[a] or e.due[b]
+        if renewed:
+            collide_bodies(e, a, b, e.setting[S_MARGIN], &m)
+        x = combine_materials(e, a, b)
+        for j in range(m.n if renewed else n):
+            if c < e.size[CAP_CONTACT]:
+                source[c] = -1 if renewed else old + j
+                new_row[c] = row
+            row += count_contact_rows(&x)
+            c += 1
+        old += n
+    n_rows[0] = row - e.size[N_JOINT_ROW]
+    return c
+
+
+cdef inline int32_t renew_contacts(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
+    """Keep the contacts whose bodies are not due, and build the others anew; return their number."""
+    cdef manifold_t m
+    cdef int32_t* source = e.order_scratch
+    cdef int32_t* new_row = source + e.size[CAP_CONTACT]
+    cdef int32_t i, k, a, b, c, n, n_rows, kj = e.size[N_JOINT], any_due = 0, last_first = is_contact_order_reversed(e)
+    cdef int32_t first = e.head[H_CACHED] if last_first else 0
+    for i in range(e.size[N_BODY]):
+        any_due |= e.due[i]
+    e.head[H_REBUILT] = any_due
+    n = e.head[H_CONTACTS]
+    if any_due:
+        n = plan_kept_contacts(e, source, new_row, &n_rows)
+        if n > e.size[CAP_CONTACT]:
+            return n
+        # Both orders of kept contacts are the same, so that moving to lower numbers from the first on, then to higher
+        # ones from the last on, overwrites no contact that is still to be moved.
+        for c in range(n):
+            if source[c] > c:
+                move_contact(e, source[c], c)
+        for c in range(n - 1, -1, -1):
+            if 0 <= source[c] < c:
+                move_contact(e, source[c], c)
+        for c in range(n):
+            if source[c] >= 0 and e.ptr[kj + source[c]] > new_row[c]:
+                move_contact_rows(e, e.ptr[kj + source[c] + 1] - e.ptr[kj + source[c]], e.ptr[kj + source[c]], new_row[c])
+        for c in range(n - 1, -1, -1):
+            if source[c] >= 0 and e.ptr[kj + source[c]] < new_row[c]:
+                move_contact_rows(e, e.ptr[kj + source[c] + 1] - e.ptr[kj + source[c]], e.ptr[kj + source[c]], new_row[c])
+        for c in range(n):
+            e.ptr[kj + c] = new_row[c]
+        e.ptr[kj + n] = e.size[N_JOINT_ROW] + n_rows
+        e.head[H_CONTACTS] = n
+        e.head[H_CONTACT_ROWS] = n_rows
+        e.head[H_MATCHES] = 0
+    else:
+        e.head[H_MATCHES] = 0
+    # right-hand sides of the kept contacts
+    for c in range(n):
+        if any_due and source[c] < 0:
+            continue
+        e.head[H_MATCHES] += e.head[H_WARM_START]
+        refresh_contact(e, p, r, c)
+    # the others
+    if any_due:
+        c = 0
+        for i in range(e.head[H_PAIRS]):
+            k = e.head[H_PAIRS] - 1 - i if last_first else i
+            a = e.pair[2 * k]
+            b = e.pair[2 * k + 1]
+            if e.due[a] or e.due[b]:
+                collide_bodies(e, a, b, e.setting[S_MARGIN], &m)
+                if m.n > 0:
+                    e.head[H_MATCHES] += add_contacts_of_pair(e, r, a, b, &m, c, new_row[c], &first)
+                c += m.n
+            else:
+                while c < n and source[c] >= 0 and e.contact_pair[2 * c] == a and e.contact_pair[2 * c + 1] == b:
+                    c += 1
+        for i in range(e.size[N_BODY]):
+            if e.due[i]:
+                e.moved[i] = 0.0
+                e.due[i] = 0
+    return n
 
 
 cdef inline void store_contact_cache(engine_t* e) noexcept nogil:

@@ -2,9 +2,10 @@
 
     start       frames, world inverse inertia, v* = v + h g
     pairs       pairs of overlapping bounding boxes
-    contacts    joint rows; then manifolds, contact rows, warm start from the cache
+    contacts    joint rows; then manifolds, contact rows, warm start from the cache. After the first substep of a step: only those
+                of bodies that have moved (engine/contacts.pxd, (5)); the others keep their rows
     solve       dv = M^-1 J^T lam, then `iterations` sweeps: all joints, then all contacts
-    finish      shift of the position projection, v = v* + dv, poses, cache
+    finish      shift of the position projection, v = v* + dv, poses; then gaps, or in the last substep of a step the cache
 
 `prepare_substep` performs the first three stages and does not change the state; if a capacity is too small, it reports the
 needed capacity. Between `prepare_substep` and `finish_substep` any solver may replace `solve_substep`: it reads the velocity
@@ -23,21 +24,25 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, fin
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS, H_CONTACT_ROWS,
-                                         H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED,
-                                         H_SOLVED, H_STEP, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
-                                         N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_OUT, TOP_DOWN,
-                                         bind_engine_arrays, engine_t)
+from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR,
+                                         COLORED, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST,
+                                         H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER,
+                                         H_PHASE, H_REBUILT, H_SEED, H_SUBSTEPS, H_SOLVED, H_STEP,
+                                         H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC,
+                                         N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT,
+                                         SYMMETRICALLY, S_OUT, TOP_DOWN, bind_engine_arrays,
+                                         engine_t)
 from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
-from lavender_ext.engine.contacts cimport build_contacts, store_contact_cache
+from lavender_ext.engine.contacts cimport build_contacts, follow_gaps, renew_contacts, store_contact_cache
 from lavender_ext.engine.joints cimport build_joint_rows, store_joint_impulses
 from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
 from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
-from lavender_ext.sweep.packed cimport MAX_PACKED_BLOCKS, packed_workspace_size, sweep_packed
+from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, pack_blocks_in_order, packed_t, packed_workspace_size,
+                                        refresh_packed_contacts, sweep_packed)
 from lavender_ext.sweep.pgs cimport sweep_bodies
 
 
@@ -61,7 +66,7 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     bind_substep_problem(e, &p, &r)
     if e.size[N_JOINT] > 0:
         build_joint_rows(e)
-    contacts = build_contacts(e, &r)
+    contacts = renew_contacts(e, &p, &r) if e.head[H_PHASE] > 0 else build_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
         return NEED_CAPACITY
@@ -97,6 +102,9 @@ cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
     if mode == REVERSED:
         reverse_blocks(e.order, 0, kj)
         reverse_blocks(e.order, kj, n)
+    elif mode == ALTERNATING:
+        if e.head[H_PHASE] & 1:                         # The first substep of the step built the contacts in its order.
+            reverse_blocks(e.order, kj, n)
     elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
         if mode == COLORED:
             levels = color_blocks_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
@@ -122,17 +130,43 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
     out[1] = s.energy
 
 
-cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
+cdef struct packs_t:            # packed blocks of the substeps of a call: in odd phases the contacts are visited in reverse
+    packed_t packed[2]
+    double* workspace[2]        # NULL: blocks are not packed
+    bint is_valid[2]
+
+
+cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
+                                     packs_t* packs) noexcept nogil:
+    """Run the sweeps over packed blocks and return True, or return False if they cannot be packed.
+
+    Records are used again in a later substep if all rows are still the same, except for the right-hand sides of contacts.
+    """
+    cdef int32_t way = e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
+    if e.head[H_REBUILT] or r.n_joints > 0:
+        packs.is_valid[0] = packs.is_valid[1] = False
+    if packs.is_valid[way]:
+        refresh_packed_contacts(p, e.order, &packs.packed[way], e.impulse)
+    elif not pack_blocks_in_order(p, r, e.order, False, packs.workspace[way], e.impulse, &packs.packed[way]):
+        return False
+    packs.is_valid[way] = True
+    sweep_packed(p, r, e.order, &packs.packed[way], sweeps, e.impulse, e.dv)
+    return True
+
+
+cdef inline void solve_substep(engine_t* e, int32_t sweeps, packs_t* packs, bint measures, double* curve,
+                               double* scratch) noexcept nogil:
     """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only.
 
-    curve (sweeps + 1, 2) or NULL receives max |e_n| and E before the first sweep and after each.
+    With `measures`, the errors before and after the sweeps are measured. curve (sweeps + 1, 2) or NULL receives max |e_n| and E
+    before the first sweep and after each.
     """
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     cdef int32_t i, mode
     cdef uint64_t rng
-    cdef bint packs = e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM     # The order does not change.
+    cdef bint packs_blocks
     bind_substep_problem(e, &p, &r)
     # warm start, and error before the first sweep
     if e.head[H_WARM_START]:
@@ -140,7 +174,8 @@ cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, d
     else:
         for i in range(6 * e.size[N_DYNAMIC]):
             e.dv[i] = 0.0
-    measure_contact_errors(e, out + 4, out + 6)
+    if measures:
+        measure_contact_errors(e, out + 4, out + 6)
     if curve != NULL:
         record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
@@ -148,8 +183,9 @@ cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, d
     # sweeps, over packed blocks if that pays, with the same bits
     set_sweep_order_of_blocks(e)
     sweeps = e.head[H_ITERATIONS]
-    packs = packs and workspace != NULL and sweeps >= MIN_PACKED_SWEEPS
-    if not packs or not sweep_packed(&p, &r, e.order, sweeps, workspace, e.impulse, e.dv):
+    packs_blocks = (packs != NULL and sweeps >= MIN_PACKED_SWEEPS
+                    and e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM)   # The order does not change.
+    if not packs_blocks or not sweep_packed_blocks(e, &p, &r, sweeps, packs):
         mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
         # every substep has its own random stream, a function of seed and substep alone
         rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
@@ -159,7 +195,8 @@ cdef inline void solve_substep(engine_t* e, int32_t sweeps, double* workspace, d
             sweep_bodies(&p, &r, e.order, p.n_blocks, e.impulse, e.dv)
             if curve != NULL:
                 record_sweep_error(e, &p, &r, curve + 2 * (i + 1), scratch)
-    measure_contact_errors(e, out + 5, out + 7)
+    if measures:
+        measure_contact_errors(e, out + 5, out + 7)
 
 
 cdef inline int32_t first_dynamic_body_of_pair(const engine_t* e, const int32_t* pair) noexcept nogil:
@@ -184,8 +221,8 @@ cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
 
 
 cdef int32_t finish_substep(engine_t* e) noexcept nogil:
-    """Write the statistics, store the contact cache, project and advance the bodies; return OK or NOT_FINITE."""
-    cdef int32_t shifted, nonfinite_body
+    """Write the statistics, project and advance the bodies, prepare the next substep's contacts; return OK or NOT_FINITE."""
+    cdef int32_t shifted, nonfinite_body, last
     cdef double* out = e.setting + S_OUT
     # statistics
     out[0] = e.head[H_ITERATIONS]
@@ -193,13 +230,17 @@ cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     out[2] = e.head[H_CONTACTS]
     out[3] = e.head[H_MATCHES]
     store_joint_impulses(e)
-    # cache, projection, integration
+    # projection, integration
     nonfinite_body = find_nonfinite_body(e)
-    store_contact_cache(e)
     shifted = project_positions(e)
     e.head[H_LOST] = advance_bodies(e, shifted)
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
+    # gaps and cache for the next substep
+    last = e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS]
+    if last or follow_gaps(e, shifted):
+        store_contact_cache(e)
+    e.head[H_PHASE] = 0 if last else e.head[H_PHASE] + 1
     e.head[H_SOLVED] = 1
     e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
@@ -219,7 +260,7 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    solve_substep(&e, sweeps, NULL, NULL, NULL)
+    solve_substep(&e, sweeps, NULL, True, NULL, NULL)
 
 
 cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -231,7 +272,7 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    solve_substep(&e, 1, NULL, curve, scratch)
+    solve_substep(&e, 1, NULL, True, curve, scratch)
 
 
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
@@ -242,18 +283,21 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
     return finish_substep(&e)
 
 
-cdef inline int32_t run_substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
-    """Run up to n substeps; `done` receives the number completed.
+cdef inline int32_t run_substeps(engine_t* e, int32_t n, packs_t* packs, int32_t* done) noexcept nogil:
+    """Run up to n substeps; `done` receives the number completed. The errors of the sweeps are measured in the last one.
 
-    workspace: for packed blocks, of the size that `packed_workspace_size` returns for the capacities, or NULL: slower, same bits.
+    packs: memory for packed blocks, each of the size that `packed_workspace_size` returns for the capacities, or NULL: slower,
+    same bits.
     """
     cdef int32_t status
     done[0] = 0
+    if packs != NULL:
+        packs.is_valid[0] = packs.is_valid[1] = False
     while done[0] < n:
         status = prepare_substep(e)
         if status != OK:
             return status
-        solve_substep(e, 1, workspace, NULL, NULL)
+        solve_substep(e, 1, packs, done[0] == n - 1, NULL, NULL)
         status = finish_substep(e)
         done[0] += 1
         if status != OK:
@@ -281,6 +325,7 @@ cdef class Buffers:
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
     cdef double[::1] workspace
+    cdef packs_t packs
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -290,8 +335,12 @@ cdef class Buffers:
         cdef int64_t used[3]
         bind_engine_arrays(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
         cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MAX_PACKED_BLOCKS), joints = size[N_JOINT]
-        self.workspace = np.empty(packed_workspace_size(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
-                                      size[N_DYNAMIC]) if joints <= MAX_PACKED_BLOCKS else 1)
+        cdef int64_t length = 1
+        if joints <= MAX_PACKED_BLOCKS:
+            length = packed_workspace_size(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT], size[N_DYNAMIC])
+        self.workspace = np.empty(2 * length)
+        self.packs.workspace[0] = &self.workspace[0]
+        self.packs.workspace[1] = &self.workspace[length]
 
     def count_broad_phase_pairs(self):
         """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""
@@ -311,14 +360,14 @@ cdef class Buffers:
     def solve(self, bint sweeps=True):
         """Solve the prepared problem; without `sweeps` only apply and measure the warm start."""
         with nogil:
-            solve_substep(&self.e, sweeps, NULL, NULL, NULL)
+            solve_substep(&self.e, sweeps, NULL, True, NULL, NULL)
 
     def sweep_and_record_errors(self, double[:, ::1] curve):
         """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            solve_substep(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
+            solve_substep(&self.e, 1, NULL, True, &curve[0, 0], &scratch[0])
 
     def apply_impulses(self):
         """Compute dv and the final error of impulses that another solver has written."""
@@ -340,7 +389,7 @@ cdef class Buffers:
         """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = run_substeps(&self.e, n, &self.workspace[0], &done)
+            status = run_substeps(&self.e, n, &self.packs, &done)
         return status, done
 
     def arrays(self):

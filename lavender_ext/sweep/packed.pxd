@@ -31,5 +31,7 @@ cdef void copy_packed_impulses(const blocks_t* p, const int32_t* order, const pa
                                double* lam) noexcept nogil
 cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* packed, int32_t sweeps, bint backwards,
                         double* lam, double* v) noexcept nogil
-cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps, double* workspace,
-                          double* lam, double* v) noexcept nogil
+cdef void refresh_packed_contacts(const blocks_t* p, const int32_t* order, const packed_t* packed,
+                                  const double* lam) noexcept nogil
+cdef void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, const packed_t* packed, int32_t sweeps,
+                       double* lam, double* v) noexcept nogil

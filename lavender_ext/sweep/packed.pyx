@@ -23,7 +23,7 @@ from libc.stdint cimport int32_t, int64_t, uintptr_t
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.pair cimport LANES, load_pair, pair_t, store_pair
 from lavender_ext.core.view cimport get_block_bodies, rows_t
-from lavender_ext.sweep.records cimport (CODE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES,
+from lavender_ext.sweep.records cimport (CODE, CONTACT_SIZE, HEADER_SIZE, MAX_RECORD_ROWS, N_KINDS, OWNER, UNPACKED, VELOCITY_BYTES,
                                          WRITE_OFFSET, classify_record_kind, decode_record_kind, count_record_rows,
                                          decode_previous_record_size, encode_record_header, record_size_in_pairs, relax_record,
                                          decode_record_size, write_block_record)
@@ -403,21 +403,31 @@ cdef void sweep_records(const blocks_t* p, const rows_t* r, const packed_t* pack
             relax_records(p, r, packed, &span[i], lam, v)
 
 
-cdef int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps, double* workspace,
-                          double* lam, double* v) noexcept nogil:
-    """Pack the blocks and run sweeps over them; v (n_bodies, 6). Return 0 without a sweep if nothing can be packed."""
-    cdef packed_t packed
-    cdef double* body
+cdef void refresh_packed_contacts(const blocks_t* p, const int32_t* order, const packed_t* packed,
+                                  const double* lam) noexcept nogil:
+    """Write new right-hand sides and impulses lam (m) to the records of contacts, which are the same otherwise."""
+    cdef int32_t i, k, n, row
+    cdef double* x
+    for i in range(p.n_blocks):
+        x = <double*>(packed.first + packed.lane[i] // LANES)
+        n = count_record_rows(decode_record_kind((<int64_t*>x)[CODE * LANES]))
+        row = p.ptr[order[i]]
+        x += LANES * HEADER_SIZE + packed.lane[i] % LANES
+        for k in range(n):
+            x[LANES * k] = lam[row + k]
+            x[LANES * (CONTACT_SIZE + 2 * n + k)] = p.b[row + k]
+
+
+cdef void sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, const packed_t* packed, int32_t sweeps,
+                       double* lam, double* v) noexcept nogil:
+    """Run sweeps over packed blocks, which hold the impulses; v (n_bodies, 6). lam (m) receives the impulses."""
+    cdef double* body = packed.end
     cdef int32_t i
-    if not pack_blocks_in_order(p, r, order, False, workspace, lam, &packed):
-        return 0
-    body = packed.end
     for i in range(6 * r.n_bodies):
         body[i] = v[i]
     for i in range(12):
         body[6 * r.n_bodies + i] = 0.0
-    sweep_records(p, r, &packed, sweeps, False, lam, body)
+    sweep_records(p, r, packed, sweeps, False, lam, body)
     for i in range(6 * r.n_bodies):
         v[i] = body[i]
-    copy_packed_impulses(p, order, &packed, False, lam)
-    return 1
+    copy_packed_impulses(p, order, packed, False, lam)

@@ -42,7 +42,7 @@ GIVEN = (
     "joint_body",
     "excluded",
 )
-FIXED_HEAD = ("position_iterations", "order", "seed", "friction_shape")
+FIXED_HEAD = ("position_iterations", "order", "seed", "friction_shape", "substeps")
 WRITTEN_SETTINGS = {
     "out": 8,
     "depth": 1,
@@ -115,7 +115,8 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
     ranges = {
         **counters,
         **dict.fromkeys(("contacts", "matches", "cached"), (0, contacts)),
-        **dict.fromkeys(("pairs_valid", "warm_start", "solved"), (0, 1)),
+        **dict.fromkeys(("pairs_valid", "warm_start", "solved", "rebuilt"), (0, 1)),
+        "phase": (0, 0),
         "contact_rows": (0, contacts * per),
         "pairs": (0, int(new.size[CAP_PAIR])),
         "iterations": sweeps,

@@ -72,6 +72,9 @@ class Simulation(Stepping):
     def constraint_problem(self) -> Problem:
         """Return the velocity problem of the next substep, with its warm start as `guess`; the state is unchanged.
 
+        It is the first substep of the next step, in which all contacts are built. Later substeps keep the rows of
+        contacts whose bodies hardly move, and differ from it in velocities, gaps and impulses.
+
         `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n = `solver_iterations` returns the
         impulses of that substep bit for bit. Pass the scene's `order` to it, unless the order is `alternating`: the
         contacts of the problem are then already in the order of the sweep. The observation of a step contains the

@@ -21,7 +21,7 @@ from lavender.sim.engine.check import check_snapshot_fields
 from lavender_ext.engine.arrays import compute_buffer_lengths
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
-VERSION = 1
+VERSION = 2
 HEADER_FIELDS = ("fingerprint", "steps", "failed", "lost")
 ARRAYS = (("size", "<i4"), ("real", "<f8"), ("index", "<i4"), ("keys", "<u8"))
 

@@ -221,6 +221,7 @@ def _put_parameters(state: State, p: Parameters) -> None:
     head[HEAD["order"]] = ORDER_NUMBER[p.order]
     head[HEAD["seed"]] = p.seed
     head[HEAD["friction_shape"]] = p.friction_shape == "box"
+    head[HEAD["substeps"]] = p.substeps
     head[HEAD["lost"]] = -1
     setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
 

@@ -130,9 +130,11 @@ def test_simulation_continued_in_any_way_has_the_bits_of_the_run(name, more, tmp
         assert trajectory(twin, 20) == expected, way
 
 
-def test_scene_substeps_have_the_bits_of_shorter_steps():
-    one = lv.Simulation(lv.Scene("stack", n=3, dt=0.01, substeps=2))
-    two = lv.Simulation(lv.Scene("stack", n=3, dt=0.005, substeps=1))
+def test_scene_substeps_have_the_bits_of_shorter_steps_if_every_substep_builds_contacts():
+    # Without a margin no contact is kept for a body that moves; alternating orders would differ in the first substeps.
+    more = {"n": 3, "order": "given", "margin": 0.0}
+    one = lv.Simulation(lv.Scene("stack", dt=0.01, substeps=2, **more))
+    two = lv.Simulation(lv.Scene("stack", dt=0.005, substeps=1, **more))
     for _ in range(30):
         two.step()
         assert trajectory(one, 1) == trajectory(two, 1)

@@ -239,6 +239,7 @@ export class Simulation {
     this.newton = newton;
     this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
     this.array("setting")[this.k.layout.setting.h] = this.scene.dt / this.substeps;
+    this.array("head")[this.k.layout.head.substeps] = this.substeps;
   }
 
   #stepNewton() {
