@@ -9,8 +9,8 @@ Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
 Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
            of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the
-           data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide), `compare`
-           (why two engines, or an engine and the rigid laws, differ after a step)
+           data), `motion_error`, `redundancy`, `contact_forces` (in newtons), `explain_slip` (why contacts slide),
+           `compare` (why two engines, or an engine and the rigid laws, differ after a step)
 Engine     `Scene`, `Simulation`
 Measuring  `report`, `suite` (built-in problems), `io` (files and other simulators)
 
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from lavender.batch.solve import Solutions, solve_many
     from lavender.causes.comparison import Comparison, compare
     from lavender.diagnostics import Diagnostic, diagnose
+    from lavender.diagnostics.forces import ContactForces, contact_forces
     from lavender.diagnostics.motion_error import MotionError, motion_error
     from lavender.diagnostics.redundancy import Redundancy, redundancy
     from lavender.gradient import Derivative, derivative, derivatives
@@ -89,6 +90,7 @@ _LAZY_NAMES = {
     "lavender.io": ("load",),
     "lavender.report.check": ("CrossCheck", "cross_check"),
     "lavender.diagnostics": ("Diagnostic", "diagnose"),
+    "lavender.diagnostics.forces": ("ContactForces", "contact_forces"),
     "lavender.diagnostics.redundancy": ("Redundancy", "redundancy"),
     "lavender.diagnostics.motion_error": ("MotionError", "motion_error"),
     "lavender.audit.slip": ("SlipExplanation", "explain_slip"),
@@ -130,6 +132,7 @@ __all__ = [
     "Claim",
     "Comparison",
     "Cones",
+    "ContactForces",
     "CrossCheck",
     "Derivative",
     "Diagnostic",
@@ -163,6 +166,7 @@ __all__ = [
     "available",
     "available_solvers",
     "compare",
+    "contact_forces",
     "cross_check",
     "derivative",
     "derivatives",

@@ -576,6 +576,11 @@ add(
     lv.diagnose,
 )
 add({"problem": STEP, "impulse": np.zeros(3)}, lv.explain_slip)
+CONTACT_SOLUTION = lv.solve(CONTACT, tol=1e-12).impulse
+add(
+    {"problem": CONTACT, "impulse": np.zeros(CONTACT.m), "dt": 0.01, "reference": CONTACT_SOLUTION},
+    lv.contact_forces,
+)
 add(
     {
         "tolerances": (1e-3,),
@@ -759,6 +764,7 @@ NOT_CALLED = [
     "MotionError",
     "SlipExplanation",
     "Redundancy",
+    "ContactForces",
     "Diagnostic",
     "Recording",
     "Stored",

@@ -60,6 +60,10 @@ TREND_RATIO = (
 )
 MIN_TREND_SHARE = 0.05  # Share of the steps that has to exceed it; fewer are isolated spikes.
 MAX_NAMED_ROWS = 8  # Rows of the table of rows.
+FORCES_NOTE = (
+    "Impulse of the engine / time step, beside the exact solution's. The bodies alone determine a force of a contact, "
+    "or only the sum of the normal forces between two bodies, or neither."
+)
 CLASS_COLORS = ("var(--h4)", "var(--h3)", "var(--h1)", "var(--bad)", "var(--ink)")
 ERROR_DEFINITION = (
     "The error of a step is that of its worst row: how far a row's velocity after the step is from one that the row's "
@@ -137,6 +141,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
             "A wrong claim hides an error; a missing claim costs iterations.",
         ),
         ("Quantiles of the errors", audit.errors, ""),
+        ("Contact forces of the worst steps", audit.forces, FORCES_NOTE),
         ("Rows and contacts of a step", audit.judged_sizes.table, ""),
         (
             "Worlds that diverged",
@@ -155,7 +160,7 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     if counts.above and audit.engine == "mujoco" and not audit.divergences and runs.source:
         code = [format_next_command(audit, counts.limit)]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
-    files = "records.npz (every step), numbers.json, states.npz, worst/, figures/ (PDF, SVG, PNG)"
+    files = "records.npz (every step), numbers.json, states.npz, worst/, forces.csv, figures/ (PDF, SVG, PNG)"
     footer = [f"{starts}. Files: {files}."]
     return Page(
         "lavender audit",
@@ -331,8 +336,8 @@ class AuditCounts:
                 are = "answer of the engine is" if n_wrong == 1 else "answers of the engine are"
                 texts.append(
                     f"{format_number(n_wrong)} {are} no solution of its own problem: the error is at least that of "
-                    "zero impulses, which no early stop explains. The state or the model may have changed within the "
-                    "step."
+                    "zero impulses. A solve that stops early from a bad start, or a state or model that changes "
+                    "within the step, leaves such answers."
                 )
         elif n := int((stopped | wrong).sum()):
             count = f"{format_count(n, 'solve')} ({format_percent(n, self.n, 1)})"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lavender.audit.bodies import find_bodies
 from lavender.audit.page import AuditCounts, ResultPage, StepSizes, make_audit_page
 from lavender.audit.pieces import (
     AUDIT_VERDICTS,
@@ -27,9 +29,12 @@ from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.rigid_laws import StepCauses
 from lavender.audit.simulated_worlds import Divergence, Runs, can_any_geoms_collide
 from lavender.base.arrays import FloatArray, check_choice
+from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
+from lavender.diagnostics.forces import contact_forces
+from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.npz import write_npz
-from lavender.io.stored import prepare_step_folder, write_arrays
+from lavender.io.stored import prepare_step_folder, write_arrays, write_text
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.text import (
     format_count,
@@ -406,7 +411,7 @@ class Audit:
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
         (worlds, steps)), `verdicts`, `diverged`, rows of (world, step), and of an engine with claims `converged`.
         `states.npz` holds the states before the worst steps, one row each, by the engine's names; for MuJoCo
-        `state` is their mjSTATE_INTEGRATION.
+        `state` is their mjSTATE_INTEGRATION. `forces.csv` has a row for each contact of the worst steps (`forces`).
         """
         folder = self.folder = Path(folder)
         worst = prepare_step_folder(folder / "worst", replace=True)
@@ -424,6 +429,22 @@ class Audit:
         if self.against is not None:
             records["against"] = self.against.numbers[0]
         write_arrays(folder / "records.npz", records)
+        write_text(folder / "forces.csv", self.forces.to_csv(index=False))
+
+    @cached_property
+    def forces(self) -> pd.DataFrame:
+        """Contact forces of the worst steps of a model [N], as `lavender.contact_forces`; empty for other engines."""
+        frames = []
+        for i, w in enumerate(self.worst if self.runs.model is not None else (), 1):
+            dt = float(self.runs.model.opt.timestep)
+            with contextlib.suppress(InputError):  # A step without a solution has no exact forces.
+                pairs = partial(find_bodies, import_mujoco(), self.runs.model)
+                table = contact_forces(w.problem, w.impulse, dt=dt, pairs=pairs).table
+                table.insert(0, "file", f"worst_{i}.npz")
+                table.insert(1, "world", w.world)
+                table.insert(2, "step", w.step)
+                frames.append(table)
+        return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
     def save_states(self, kind: str, path: str | os.PathLike[str]) -> int:
         """Write states before steps to a file that `--states` reads, and return their number.

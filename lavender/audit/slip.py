@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.audit.bodies import get_geoms
 from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
@@ -484,11 +485,6 @@ def _is_dry_friction(block: ConstraintBlock) -> bool:
     assert block.bounds is not None
     lower, upper = block.bounds
     return len(lower) == 1 and bool(np.isfinite(upper[0])) and float(upper[0]) == -float(lower[0])
-
-
-def get_geoms(contact: str) -> str:
-    """Return the names of both geoms of a contact, without the contact's number."""
-    return contact.partition(" (")[2].rstrip(")") or contact
 
 
 def _add_dominant_cause(slips: pd.DataFrame) -> pd.DataFrame:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.audit.bodies import find_bodies, find_geom, get_geoms
 from lavender.audit.page import ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.settings import MujocoSetting, get_option_value
@@ -22,7 +23,6 @@ from lavender.audit.slip import (
     SlipExplanation,
     average_slip,
     explain_record,
-    get_geoms,
     name_blocks,
     read_slip,
     tabulate_slip,
@@ -294,26 +294,6 @@ def _get_uses(explanation: SlipExplanation) -> FloatArray:
     return np.zeros(len(explanation.contacts)) if use is None else use
 
 
-def find_bodies(mj: Any, model: Any, contact: str) -> str:
-    """Return the names of the two bodies of a contact, sorted; bodies that are welded together have one name.
-
-    Without two geoms, as for a flex, it is the names of the sides themselves.
-    """
-    sides = get_geoms(contact).split(", ")
-    geoms = [_find_geom(mj, model, side) for side in sides]
-    if len(geoms) != 2 or min(geoms) < 0:
-        return get_geoms(contact)
-    bodies = [int(model.body_weldid[model.geom_bodyid[geom]]) for geom in geoms]
-    kind = mj.mjtObj.mjOBJ_BODY
-    return " and ".join(sorted(mj.mj_id2name(model, kind, b) or f"body {b}" for b in bodies))
-
-
-def _find_geom(mj: Any, model: Any, name: str) -> int:
-    """Return the number of a geom by its name, or by its number if it has no name; -1 if there is none."""
-    geom = int(mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name))
-    return int(name) if geom < 0 and name.isdigit() and int(name) < model.ngeom else geom
-
-
 def _change_settings(
     mj: Any, model: Any, pair: str, contacts: Iterable[str]
 ) -> Iterator[tuple[str, Any]]:
@@ -339,7 +319,7 @@ def _change_settings(
         yield f'solref="{shortest:g} 1" of all geoms', changed
 
     names = list(dict.fromkeys(x for c in contacts for x in get_geoms(c).split(", ")))
-    numbers = [_find_geom(mj, model, name) for name in names]
+    numbers = [find_geom(mj, model, name) for name in names]
     if " and " in pair and numbers and min(numbers) >= 0:
         changed = copy.deepcopy(model)
         friction = FRICTION_FACTOR * float(model.geom_friction[numbers, 0].max())

@@ -15,7 +15,7 @@ from lavender.cli.options import print_escaped
 
 #: Names of the commands by the heading under which `lavender --help` lists them.
 COMMAND_GROUPS = {
-    "Solve and judge": ("solve", "check", "explain"),
+    "Solve and judge": ("solve", "judge", "check", "explain"),
     "Measure": ("report",),
     "MuJoCo": ("record", "audit", "tune", "slip", "compare"),
     "Engine": ("run", "web"),

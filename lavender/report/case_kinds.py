@@ -34,6 +34,21 @@ ENERGY_ROUNDING = 2.0**-48  # Rounding of a sum of products, divided by the sum 
 ROUNDING = 2.0**-50  # [-] Rounding error of a sum, relative to the sum of its absolute terms.
 
 
+def compute_energy_gain(problem: Problem, impulse: FloatArray, slack: FloatArray) -> float:
+    """Return the energy [J] that an impulse (m,) [N s] adds beyond the work of the targets, 0 within its rounding.
+
+    With A lambda = w + b it is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a
+    solution if the bounds of all rows contain 0; nan if they do not, or if the bodies are not known.
+    """
+    cones = problem.cones
+    if problem.matrix is not None or (cones.lower > 0.0).any() or (cones.upper < 0.0).any():
+        return math.nan
+    soft = 0.0 if problem.compliance is None else problem.compliance * impulse
+    gain = 0.5 * float(impulse @ (slack - problem.b - soft))
+    rounding = float(np.abs(impulse) @ (np.abs(slack) + 2.0 * np.abs(problem.b)))
+    return gain if gain > ENERGY_ROUNDING * rounding else 0.0
+
+
 class ContactCase:
     """A problem of rows, boxes or contacts."""
 
@@ -72,14 +87,7 @@ class ContactCase:
         change = gain = math.nan
         if problem.matrix is None and np.isfinite(impulse).all():
             change = problem.energy_change(impulse)
-            if not ((problem.cones.lower > 0.0).any() or (problem.cones.upper < 0.0).any()):
-                # The part of the change beyond the work of the targets, 0 within its rounding. With A lambda = w + b it
-                # is lambda.(w - b) / 2 - lambda.diag(compliance) lambda / 2, which is not positive at a solution if the
-                # bounds of all rows contain 0.
-                soft = 0.0 if problem.compliance is None else problem.compliance * impulse
-                gain = 0.5 * float(impulse @ (r.slack - problem.b - soft))
-                rounding = float(np.abs(impulse) @ (np.abs(r.slack) + 2.0 * np.abs(problem.b)))
-                gain = gain if gain > ENERGY_ROUNDING * rounding else 0.0
+            gain = compute_energy_gain(problem, impulse, r.slack)
         return {
             "relative": float(r.relative),
             "error_energy": float(r.energy),

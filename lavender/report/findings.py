@@ -331,6 +331,15 @@ class Report(Contents):
             f"{r.solver} in {format_count(counts[r.solver], 'run')}, at most {r.energy_gain:.2g} J ({r.case})"
             for r in worst.sort_values("energy_gain", ascending=False).itertuples()
         ]
+        own = tables.read_own_answers(self)
+        own = own[own["energy_gain"] > 0.0]
+        if len(own):  # The user's engine comes first, because only the first sentence is shown.
+            most = own.loc[own["energy_gain"].idxmax()]
+            count = format_count(len(own), "step")
+            engine = (
+                f"{ENGINE_NAME} in {count}, at most {most['energy_gain']:.2g} J ({most['case']})"
+            )
+            energy_gains.insert(0, engine)
         return [
             *(
                 [f"{self.busy} The times are invalid; measure again with --no-reuse."]

@@ -88,6 +88,30 @@ class SweepStudy:
         return f"lavender report --sweeps · {', '.join(names[:3])} · {format_count(self.n_steps, 'recorded step')}"
 
     @property
+    def _count_sentence(self) -> str:
+        """How many of the recorded steps count, and why the others do not; empty if all count."""
+        report = self.report
+        steps = report.cases[report.cases["sequence"].isin(self.runs["sequence"].unique())]
+        n_first = int((steps["step"] == 0).sum())
+        n_zero = report.newest[
+            report.newest["nothing_to_do"].astype(bool) & (report.newest["step"] > 0)
+        ]["case"].nunique()
+        parts = []
+        if n_first:
+            one = "the first has no step before it"
+            parts.append(one if n_first == 1 else f"the first {n_first} have no step before them")
+        if n_zero:
+            parts.append(f"the zero impulse solves {n_zero}")
+        if not parts:
+            return ""
+        engine = len(self.answers)
+        own = f", and your engine's answers to {engine}" if engine not in (0, self.n_steps) else ""
+        return (
+            f"Of {format_count(len(steps), 'recorded step')}, {' and '.join(parts)}: solvers are compared on "
+            f"{self.n_steps}{own}."
+        )
+
+    @property
     def verdict(self) -> str:
         """How many sweeps are enough, or that no measured number is."""
         best = self._find_smallest(self.first)
@@ -136,6 +160,8 @@ class SweepStudy:
             lines.append(
                 f"Your engine's own {own} {size}, {share}; the worst is {worst['file']}{row}."
             )
+        if counted := self._count_sentence:
+            lines.append(counted)
         needs = [(g[0], self._find_smallest(g[0])) for g in self.groups[1:]]
         texts = [
             f"{name} needs {n}" if n else f"{name} more than {self.budgets[-1]}"

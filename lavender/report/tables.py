@@ -27,6 +27,7 @@ from lavender.judge.residuals import DEFAULT_THRESHOLD, at_floor
 from lavender.judge.solution import CONFIRMED, CONTRADICTED
 from lavender.problem.derived import cached_property
 from lavender.report import machine
+from lavender.report.case_kinds import compute_energy_gain
 from lavender.report.cases import read_engine_lines
 from lavender.report.drawing import FILE_KINDS
 from lavender.report.page import DEFAULT_ERROR_LIMIT, check_columns
@@ -58,7 +59,7 @@ MEAN_TIME_SHIFT = 1e-5
 MIN_NOISE, MAX_NOISE = 0.05, 0.25
 # Entries of an engine's answer: texts, and numbers, which are nan if they are missing.
 ANSWER_TEXTS = ("file", "verdict", "solver", "worst")
-ANSWER_NUMBERS = ("rows", "relative", "seconds", "velocity", "iterations")
+ANSWER_NUMBERS = ("rows", "relative", "seconds", "velocity", "iterations", "energy_gain")
 LEFT_OUT = "left out"  # The verdict on a step that could not be recorded.
 ENGINE_SWEEPS = (
     "sequential_impulses",
@@ -233,8 +234,8 @@ def read_engine_answers(sources: Sequence[str], lines: Frame) -> Frame:
     -------
     DataFrame
         A row for each answer, by the path of its file: folder, file, rows, seconds [s], relative, velocity [m/s],
-        iterations, worst, verdict and solver; numbers that were not recorded are nan. Steps that could not be recorded
-        have the verdict "left out".
+        iterations, energy_gain [J], worst, verdict and solver; numbers that were not recorded are nan. Steps that could
+        not be recorded have the verdict "left out".
     """
     cases = select_cases(lines)
     files = cases[cases["source"].astype(str).str.endswith(SUFFIXES)]
@@ -271,7 +272,9 @@ def _complete_answer(folder: Path, answer: Row) -> Row | None:
         # Files of earlier versions do not hold the acceleration of a step with forces without digits.
         if impulse is not None and not answer.get("lost_digits"):
             threshold = float(answer.get("threshold", DEFAULT_THRESHOLD))
-            answer = answer | describe_answer(io.load(path), impulse, threshold)
+            problem = io.load(path)
+            gain = compute_energy_gain(problem, impulse, problem.slack(impulse))
+            answer = answer | describe_answer(problem, impulse, threshold) | {"energy_gain": gain}
     try:
         numbers = {
             x: math.nan if answer.get(x) is None else float(answer[x]) for x in ANSWER_NUMBERS

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from calls import BOXES
 from calls import EARLY_BOXES as EARLY
@@ -477,3 +478,23 @@ def test_audit_prints_the_next_command_as_it_can_be_pasted(tmp_path, monkeypatch
     own = audit(model, worlds=2, steps=20, workers=1, max_velocity_error=1e-9)
     own.write("own")
     assert not own.page.make_page(None).code
+
+
+def test_audit_writes_the_contact_forces_of_its_worst_steps(boxes, tmp_path):
+    found = audit(boxes(EARLY), worlds=2, steps=20, workers=1)
+    found.write(tmp_path)
+    table = pd.read_csv(tmp_path / "forces.csv")
+    assert len(table) and set(table["file"]) <= {
+        f"worst_{i + 1}.npz" for i in range(len(found.worst))
+    }
+    first = table[table["file"] == "worst_1.npz"]
+    worst = found.worst[0]
+    forces = lv.contact_forces(worst.problem, worst.impulse, dt=found.runs.model.opt.timestep)
+    total = first["normal force [N]"].sum()
+    known = [
+        f
+        for f, kind in zip(forces.normal, forces.determined, strict=True)
+        if kind != "not determined"
+    ]
+    np.testing.assert_allclose(total, np.sum(known), rtol=1e-9)
+    assert "Contact forces of the worst steps" in found.page.write(tmp_path / "page").read_text()

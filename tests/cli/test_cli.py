@@ -76,6 +76,7 @@ RUNS = {
     "tune": ("m.xml", "--worlds", 2, "--steps", 2),
     "record": ("m.xml", "--steps", 1, "--out", "out"),
     "check": ("stack(n=2)", "--solvers", "pgs"),
+    "judge": ("stack(n=2)",),
     "explain": ("stack(n=2)",),
     "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK),
     "run": ("stack", "--solver", "newton"),

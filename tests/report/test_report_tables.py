@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from approved_texts import check_text
 
+import lavender as lv
 from lavender.report import Report, tables
 from lavender.report.render import format_cells, format_markdown, list_number_heads
 from lavender.report.tables import read_engine_answers
@@ -479,3 +480,24 @@ def test_tabulate_structures_counts_a_case_that_a_solver_did_not_end_in_time_as_
     report = Report(lines_of(*made), times=(1e-2, 10.0))
     [row] = tables.tabulate_structures(report).to_dict("records")
     assert [x for name, x in row.items() if name.startswith("in ")] == ["both", "half"]
+
+
+def test_energy_that_the_users_engine_gains_is_named_first(tmp_path):
+    """An impulse that shoots a resting box up adds energy; a solver that gains less comes after the engine."""
+    problem = lv.suite.case("box_stack(n=2)").problem
+    folder = tmp_path / "steps"
+    folder.mkdir()
+    rows = []
+    for k in range(2):
+        path = folder / f"walk[{k}].npz"
+        lv.io.save(problem, path, impulse=30.0 * lv.solve(problem).impulse)
+        rows.append(
+            json.dumps({"file": path.name, "rows": problem.m, "relative": 1.0, "solver": "PGS"})
+        )
+    (folder / "engine.jsonl").write_text("\n".join(rows))
+    made = [step_of(k, "pgs", 1e-8, energy_gain=1e-3) for k in range(2)]
+    facts = {f"walk[{k}]": {"source": str(folder / f"walk[{k}].npz")} for k in range(2)}
+    lines = lines_of(*made, walk=True, cases=facts)
+    report = Report(lines, engines=read_engine_answers([], lines))
+    (text,) = [w for w in report.warnings if w.startswith("gains energy")]
+    assert "your engine in 2 steps, at most" in text and "the first of 2" in text

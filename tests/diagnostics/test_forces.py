@@ -1,0 +1,106 @@
+"""Contact forces in newtons, their errors, and what of them the bodies determine."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+DT, WEIGHT = 0.01, 98.1  # s, N: the step, and the weight of 10 kg
+
+
+def make_table(feet, friction=0.0, top=False):
+    """Return a table of 10 kg that rests on its feet, and optionally a box of 10 kg on its centre."""
+    n = 1 + top
+    builder = lv.RowBuilder(
+        [0.1] * n,
+        np.multiply.outer([10.0] * n, np.eye(3)),
+        np.array([[0.0, 0.0, -9.81 * DT, 0.0, 0.0, 0.0]] * n),
+        DT,
+        np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]][:n]),
+    )
+    for x, y in feet:
+        builder.contact(-1, 0, (x, y, 0.0), (0.0, 0.0, 1.0), mu=friction)
+    if top:
+        builder.contact(0, 1, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), mu=friction)
+    return builder.problem("coulomb")
+
+
+FOUR = [(-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]
+THREE = [(-0.5, -0.5), (0.5, -0.5), (0.0, 0.5)]
+
+
+def test_table_on_four_feet_has_only_the_sum_of_its_forces():
+    problem = make_table(FOUR, top=True)
+    exact = lv.solve(problem, tol=1e-12).impulse
+    null = np.zeros(problem.m)
+    null[:4] = [1.0, -1.0, -1.0, 1.0]  # Moves nothing: the forces of two diagonals.
+    for amount in (0.0, 0.1):
+        forces = lv.contact_forces(problem, exact + amount * null, dt=DT)
+        assert forces.determined == ("pair",) * 4 + ("contact",)
+        table = forces.table.set_index("bodies")
+        assert table.loc["ground and body 0", "normal force [N]"] == pytest.approx(2.0 * WEIGHT)
+        assert table.loc["ground and body 0", "error [N]"] < 1e-6
+        assert table.loc["body 0 and body 1", "normal force [N]"] == pytest.approx(WEIGHT)
+        assert table.loc["body 0 and body 1", "share of the load [%]"] == 100.0
+
+
+def test_forces_of_three_feet_are_determined_and_share_the_load():
+    problem = make_table(THREE)
+    exact = lv.solve(problem, tol=1e-12)
+    forces = lv.contact_forces(problem, 0.9 * exact.impulse, dt=DT, reference=exact)
+    assert forces.determined == ("contact",) * 3
+    np.testing.assert_allclose(forces.exact, WEIGHT * np.array([0.25, 0.25, 0.5]), rtol=1e-9)
+    np.testing.assert_allclose(forces.share, [0.25, 0.25, 0.5], rtol=1e-9)
+    np.testing.assert_allclose(forces.error, 0.1 * forces.exact, rtol=1e-9)
+    np.testing.assert_allclose(forces.normal, 0.9 * forces.exact, rtol=1e-12)
+
+
+def test_two_bodies_between_which_a_load_is_not_determined_have_no_number():
+    """A beam on two fixed bodies and a third in between: no pair's force is determined."""
+    builder = lv.RowBuilder(
+        [0.0, 0.0, 0.0, 0.1],
+        np.multiply.outer([0.0, 0.0, 0.0, 10.0], np.eye(3)),
+        np.array([[0.0] * 6] * 3 + [[0.0, 0.0, -9.81 * DT, 0.0, 0.0, 0.0]]),
+        DT,
+        np.array([[-0.5, 0.0, -0.1], [0.0, 0.0, -0.1], [0.5, 0.0, -0.1], [0.0, 0.0, 0.1]]),
+    )
+    for body, x in enumerate((-0.5, 0.0, 0.5)):
+        builder.contact(body, 3, (x, 0.0, 0.0), (0.0, 0.0, 1.0), mu=0.0)
+    problem = builder.problem("coulomb")
+    forces = lv.contact_forces(problem, lv.solve(problem, tol=1e-12).impulse, dt=DT)
+    assert forces.determined == ("not determined",) * 3
+    assert forces.table["normal force [N]"].isna().all() and "not determined" in str(forces)
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_forces_of_mujoco_are_those_of_mj_contact_force(cone):
+    mujoco = pytest.importorskip(
+        "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+    )
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option cone="{cone}"/><worldbody>
+      <geom name="floor" type="plane" size="0 0 1"/><body pos="0 0 .1"><freejoint/>
+      <geom name="ball" type="sphere" size=".1" mass="2"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    problem, impulse = lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data)
+    forces = lv.contact_forces(problem, impulse, dt=model.opt.timestep)
+    wanted = np.zeros(6)
+    mujoco.mj_contactForce(model, data, 0, wanted)
+    assert forces.normal == pytest.approx([wanted[0]], rel=1e-9)
+    assert forces.determined == ("contact",) and forces.pairs == ("floor and ball",)
+    assert forces.normal[0] == pytest.approx(2.0 * 9.81, rel=1e-3)
+
+
+def test_contact_forces_refuse_wrong_arguments():
+    problem = make_table(THREE)
+    impulse = lv.solve(problem).impulse
+    for dt in (0.0, -1.0, np.nan):
+        with pytest.raises(lv.InputError, match="dt"):
+            lv.contact_forces(problem, impulse, dt=dt)
+    with pytest.raises(lv.InputError, match="3 contacts"):
+        lv.contact_forces(problem, impulse, dt=DT, pairs=["one"])
+    bad = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [2.0, -1.0])
+    with pytest.raises(lv.InputError, match="reference has a relative residual"):
+        lv.contact_forces(bad, np.zeros(2), dt=DT)
