@@ -7,6 +7,7 @@ A, are computed when the world is solved.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, overload
@@ -22,13 +23,16 @@ from lavender.base.arrays import (
     check_nonnegative_magnitudes,
     check_sequence,
     get_common_precision,
+    get_shape,
     resolve_index,
 )
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
+from lavender.problem.data import convert_keys
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender_ext.batch.many import PLACE, Worlds
+from lavender_ext.core.carry import carry_impulses_of_worlds
 from lavender_ext.core.checks import are_lower_triangles_valid, are_pointers_valid
 from lavender_ext.core.problem import LAWS
 
@@ -68,6 +72,8 @@ class Batch(Sequence[Problem]):
     velocity_ptr : (n + 1,) int, optional
         First velocity of each world, followed by the number of all velocities. Needed, together with `row_ptr`, if
         worlds have different numbers of velocities.
+    key : (n, k), (k,) for all worlds, or ragged one array of all blocks, unsigned int, optional
+        Identity of each block in its world, by which `make_start` finds it in the batch of another step.
 
     Raises
     ------
@@ -106,6 +112,7 @@ class Batch(Sequence[Problem]):
         count: ArrayLike | None = None,
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
+        key: Any = None,
     ) -> None:
         friction = check_choice("friction", friction, FRICTION_LAWS)
         values, *pattern = M if isinstance(M, tuple) else (M,)
@@ -173,6 +180,7 @@ class Batch(Sequence[Problem]):
             mu_shape = (self.cones.n_blocks,) if self._has_shared_cones else None
             mu, at["mu"], _ = _flatten("mu", mu, n, mu_shape, at["blocks"])
         self._arrays: Any = (jac, mass, free, goal, soft, mu)
+        self.key = None if key is None else self._convert_keys(key)
         # `lavender.io.engine_motion.EngineMotion` of worlds that an engine moves by accelerations.
         self.engine_motions: dict[int, Any] = {}
 
@@ -233,6 +241,7 @@ class Batch(Sequence[Problem]):
     contact_counts: np.ndarray | None = (
         None  # (n,) Number of contacts with rows; None if it is not known.
     )
+    key: np.ndarray | None = None  # uint64: key of each block, world after world.
     _has_shared_cones = True
 
     # -- blocks ----------------------------------------------------------------------------------------
@@ -291,6 +300,113 @@ class Batch(Sequence[Problem]):
         check_nonnegative_magnitudes("mu", mu, "-")
         return replace(cones, mu=mu)
 
+    def _convert_keys(self, key: Any) -> np.ndarray:
+        """Convert the argument `key` to an array of the keys of all blocks, world after world."""
+        blocks = self.at["blocks"]
+        if len(self) and (blocks == blocks[0]).all():
+            shape = len(self), int(blocks[0])
+            if get_shape("key", key) in (shape[1:], shape):
+                key = np.broadcast_to(np.asarray(key), shape).reshape(-1)
+        return convert_keys(key, int(blocks.sum()))
+
+    # -- starts ------------------------------------------------------------------------------------------
+
+    def make_start(self, previous: Any) -> FloatArray:
+        """Return a start [N s] of the batch's shape from the result of another step.
+
+        The impulses of each world are assigned to its blocks by their keys, as `Problem.carry` does: blocks without a
+        previous impulse start at zero. Worlds without keys must have the same blocks in both steps. `solve_many` calls
+        this for `impulse=`.
+
+        Parameters
+        ----------
+        previous : Solutions of a batch, or (Batch, impulse)
+            With as many worlds, in the same order.
+
+        Raises
+        ------
+        InputError
+            The numbers of worlds differ, or the blocks of a world do and a batch has no keys, or a world repeats a key.
+        """
+        if isinstance(previous, tuple) and len(previous) == 2 and type(previous[0]) is Batch:
+            before = previous[0]
+            impulse = before.flatten_impulses("impulse", previous[1])
+        elif type(getattr(previous, "problems", None)) is Batch:
+            before = previous.problems
+            impulse = previous.flat_impulses[0]
+        else:
+            raise InputError(
+                f"impulse is a {type(previous).__name__}; an array of the batch's shape, Solutions of a batch, or "
+                "(Batch, impulse), is needed"
+            )
+        if len(before) != len(self):
+            raise InputError(
+                f"impulse is of {len(before)} worlds; a start of {len(self)} worlds is needed"
+            )
+        start = np.zeros(math.prod(self.shape))
+        if self.key is None or before.key is None:
+            i = self._find_other_blocks(before)
+            if i is not None:
+                raise InputError(
+                    f"impulse is of worlds with other blocks (world {i}: {before.at['rows'][i]} rows before, "
+                    f"{self.at['rows'][i]} now); give both batches a key= of each block, by which impulses are "
+                    "assigned, or an array of this batch's shape"
+                )
+            start[self._list_rows()] = impulse[before._list_rows()]
+            return start.reshape(self.shape)
+        bad, is_old = carry_impulses_of_worlds(
+            before.cones._blocks,
+            before._list_places(),
+            before.key,
+            impulse,
+            self.cones._blocks,
+            self._list_places(),
+            self.key,
+            start,
+        )
+        if bad >= 0:
+            which = "the previous batch" if is_old else "this batch"
+            raise InputError(
+                f"world {bad} of {which} repeats a key, so that impulses cannot be assigned: give each of its blocks "
+                "a key of its own"
+            )
+        return start.reshape(self.shape)
+
+    def _find_other_blocks(self, before: Batch) -> int | None:
+        """Return the first world whose blocks are others than in the batch of another step, or None."""
+        if self is before:
+            return None
+        at, old = self.at, before.at
+        differs = (at["rows"] != old["rows"]) | (at["blocks"] != old["blocks"])
+        if differs.any():
+            return int(differs.argmax())
+        # All worlds have the blocks of the first one if both batches have one set of blocks.
+        is_shared = self._has_shared_cones and before._has_shared_cones
+        own, previous = (np.stack([np.diff(x.cones.ptr), x.cones.kind]) for x in (self, before))
+        for i in range(min(len(self), 1) if is_shared else len(self)):
+            a, b, k = int(at["block"][i]), int(old["block"][i]), int(at["blocks"][i])
+            if not np.array_equal(own[:, a : a + k], previous[:, b : b + k]):
+                return i
+        return None
+
+    def _list_rows(self) -> np.ndarray:
+        """Return the places of the rows of all worlds in a flat array of impulses, without padding rows."""
+        sizes = self.at["rows"]
+        first = self.at["row"] - _compute_offsets(sizes)
+        return np.arange(int(sizes.sum())) + np.repeat(first, sizes)
+
+    def _list_places(self) -> np.ndarray:
+        """Return the columns (n, 5) that `carry_impulses_of_worlds` reads."""
+        columns = [self.at[name] for name in ("block", "blocks", "cone_row", "row")]
+        return np.stack([*columns, _compute_offsets(self.at["blocks"])], axis=1)
+
+    def _get_keys_of_world(self, i: int) -> np.ndarray | None:
+        """Return the keys of the blocks (k,) of world i, or None."""
+        if self.key is None:
+            return None
+        first = int(self.at["blocks"][:i].sum())
+        return self.key[first : first + int(self.at["blocks"][i])]
+
     def __getstate__(self) -> dict[str, Any]:
         # Copies and pickles hold the results, because the functions may hold an engine's model.
         functions = {"names_of": self.names_of, "angular_of": self.angular_of}
@@ -339,6 +455,7 @@ class Batch(Sequence[Problem]):
             precision=self.precision,
             names=None if self.names_of is None or not named else self.names_of(i),
             angular=None if self.angular_of is None or not named else self.angular_of(i),
+            key=self._get_keys_of_world(i) if named else None,
         )
         if i in self.engine_motions:
             problem.__dict__["engine_motion"] = self.engine_motions[i]

@@ -326,7 +326,8 @@ def solve_many(
     problems : Batch, or iterable of Problem
     solver : str
     impulse : N s, optional
-        For a batch: warm starts, an array of the batch's shape of impulses. Default: the zero impulse.
+        For a batch: warm starts, an array of the batch's shape of impulses; or the `Solutions` of another step, or
+        (Batch, impulse), whose impulses are assigned world by world (`Batch.make_start`). Default: the zero impulse.
     impulses : sequence of (m,) N s, optional
         For problems: warm start of each, or None. Default: as for `solve`.
     threads : int
@@ -456,6 +457,8 @@ def _convert_starts(
             raise InputError(
                 "impulses= needs a list of problems; a batch takes impulse=, one for all worlds"
             )
+        if isinstance(impulse, tuple | WorldResults):
+            impulse = worlds.make_start(impulse)
         starts = None if impulse is None else worlds.flatten_impulses("impulse", impulse)
         if starts is not None and not all_finite(starts):
             parts = ((i, starts[worlds.rows_of(i)]) for i in range(len(worlds)))

@@ -479,6 +479,10 @@ def from_mujoco_many(
 
     batch.names_of, batch.angular_of = name_blocks_of_world, find_angular_rows_of_world
     batch.contact_counts = contact_counts
+    batch.key = np.concatenate(
+        [np.zeros(0, np.uint64)]
+        + [single.get_block_keys(each) for each in blocks_of_states if each is not None]
+    )
     return Imported(batch, lam)
 
 

@@ -290,18 +290,24 @@ def _make_fields(
     mj: Any, model: Any, blocks: Any, b: FloatArray, compliance: FloatArray, general: Generalized
 ) -> dict[str, Any]:
     """Return the fields of a problem; `blocks` is the result of `mujoco_rows.make_blocks`."""
-    m, numbers = blocks.n_rows, blocks.numbers
-    first = len(numbers) - m
+    m = blocks.n_rows
     count = blocks.n_blocks
     return {
         "b": b,
         "generalized": general,
         "compliance": compliance,
         "cones": Cones._from_blocks(blocks),
-        "key": numbers[first : first + count].view(np.uint64),
+        "key": get_block_keys(blocks),
         "names": Names(count, lambda: make_block_names(mj, model, blocks.ints[2 * m + 1 :], m)),
         "angular": find_angular_rows(mj, model, blocks.ints[2 * m + 1 :], m),
     }
+
+
+def get_block_keys(blocks: Any) -> np.ndarray:
+    """Return the keys of the blocks (k,) of the result of `mujoco_rows.make_blocks`."""
+    first = len(blocks.numbers) - blocks.n_rows
+    keys: np.ndarray = blocks.numbers[first : first + blocks.n_blocks].view(np.uint64)
+    return keys
 
 
 @np.errstate(over="ignore", invalid="ignore")

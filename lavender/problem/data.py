@@ -195,7 +195,7 @@ class ProblemData:
             fields["guess"] = as_array("guess", guess, (m,), finite=False, unit="N s", copy=copy)
             check_finite("guess [N s]", fields["guess"])
         if key is not None:
-            fields["key"] = _convert_keys(key, k)
+            fields["key"] = convert_keys(key, k)
         if angular is not None:
             flags = as_array("angular", angular, (m,))
             others = flags[(flags != 0.0) & (flags != 1.0)]
@@ -479,7 +479,7 @@ def _find_law(cones: Cones, friction: str) -> str:
     return "linear" if blocks.is_free else "lcp" if blocks.is_bounded_rows else friction
 
 
-def _convert_keys(key: Any, k: int) -> np.ndarray:
+def convert_keys(key: Any, k: int) -> np.ndarray:
     """Convert keys to a checked array (k,) of uint64."""
     get_shape("key", key)
     check_unmasked("key", key)

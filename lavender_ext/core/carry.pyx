@@ -4,6 +4,7 @@ from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy, memset
 
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.start cimport clip_zero_to_row_bounds
 
 
 cdef enum:
@@ -63,3 +64,62 @@ def carry_impulses_by_key(Blocks old, const uint64_t[::1] old_keys, const double
                 memcpy(&start[new.at.ptr[i]], &impulse[old.at.ptr[j]], size * sizeof(double))
         free(table)
     return bool(new_repeated), bool(old_repeated)
+
+
+def carry_impulses_of_worlds(Blocks old, const int64_t[:, ::1] old_at, const uint64_t[::1] old_keys, const double[::1] impulse,
+                             Blocks new, const int64_t[:, ::1] new_at, const uint64_t[::1] new_keys, double[::1] start):
+    """Write the start of each world: the impulses [N s] of its blocks with the same key, kind and number of rows, else Pi(0).
+
+    The columns of old_at and new_at (n, 5) are the first block of a world in `old` and `new`, its number of blocks, its first
+    row in them, its first row in the impulses, and its first key.
+
+    Returns
+    -------
+    tuple
+        The first world that repeats a key, else -1, and whether the previous step repeats it.
+    """
+    cdef int64_t w, n_worlds = new_at.shape[0], size = MIN_TABLE_SIZE, mask, bad = -1
+    cdef int32_t i, j, k, n, n_old, rows, first, from_
+    cdef bint is_old = False
+    cdef int32_t* table
+    cdef const uint64_t* key
+    cdef const uint64_t* old_key
+    if old_at.shape[0] != n_worlds or old_at.shape[1] != 5 or new_at.shape[1] != 5:
+        raise ValueError("the places of as many worlds before and now are needed")
+    for w in range(n_worlds):
+        if old_at[w, 4] + old_at[w, 1] > old_keys.shape[0] or new_at[w, 4] + new_at[w, 1] > new_keys.shape[0]:
+            raise ValueError("a key for each block is needed")
+        while size < 2 * max(old_at[w, 1], new_at[w, 1]) + 2:
+            size *= 2
+    table = <int32_t*>malloc(size * sizeof(int32_t))
+    if table == NULL:
+        raise MemoryError(f"{size} entries of a table of keys")
+    with nogil:
+        for w in range(n_worlds):
+            n, n_old = <int32_t>new_at[w, 1], <int32_t>old_at[w, 1]
+            key = &new_keys[new_at[w, 4]] if n else NULL
+            old_key = &old_keys[old_at[w, 4]] if n_old else NULL
+            mask = MIN_TABLE_SIZE - 1
+            while mask < 2 * <int64_t>max(n, n_old):
+                mask = 2 * mask + 1
+            if index_keys(table, mask, key, n):
+                bad = w
+                break
+            if index_keys(table, mask, old_key, n_old):
+                bad, is_old = w, True
+                break
+            for i in range(n):
+                k = <int32_t>new_at[w, 0] + i
+                first, rows = new.at.ptr[k], new.at.ptr[k + 1] - new.at.ptr[k]
+                for j in range(first, first + rows):
+                    start[new_at[w, 3] + j - new_at[w, 2]] = clip_zero_to_row_bounds(&new.at, j)
+                j = table[find_table_entry(table, mask, old_key, key[i])]
+                if j < 0:
+                    continue
+                j += <int32_t>old_at[w, 0]
+                from_ = old.at.ptr[j]
+                if old.at.kind[j] == new.at.kind[k] and old.at.ptr[j + 1] - from_ == rows:
+                    memcpy(&start[new_at[w, 3] + first - new_at[w, 2]], &impulse[old_at[w, 3] + from_ - old_at[w, 2]],
+                           rows * sizeof(double))
+        free(table)
+    return bad, bool(is_old)
