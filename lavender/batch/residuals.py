@@ -387,7 +387,7 @@ def residual_many(
         is_engine = (
             i in worlds.engine_motions
             if type(worlds) is Batch
-            else "engine_motion" in worlds[i].__dict__
+            else worlds[i].engine_motion is not None
         )
         if (is_float32 or (is_engine and above_floor[i] != 0.0)) and i not in residuals.faults:
             judge_single(i)

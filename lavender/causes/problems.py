@@ -45,7 +45,7 @@ def record_of_problem(
     surface[friction] = np.where(soft > 0.0, 0.0, target)[friction]
     if surface_velocity is not None:
         surface[friction] = surface_velocity[friction]
-    motion = problem.__dict__.get("engine_motion")
+    motion = problem.engine_motion
     change = None
     if motion is not None and motion.moved_by == "acceleration":
         change = motion.change if np.array_equal(motion.impulse, impulse) else None

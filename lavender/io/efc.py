@@ -407,7 +407,7 @@ def from_mujoco_many(
             if has_moving_surfaces:  # efc_vel contains their velocities, too.
                 mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
             step.read(data)
-            mover = mover or single.find_mover(step, is_stepped=False)
+            mover = mover or single.find_mover_of_step(step, is_stepped=False)
             if not copy_state(step, i, moves, mass):
                 if errors == "raise":
                     raise InputError(f"state {i}: {single.DIVERGED_TEXT}")

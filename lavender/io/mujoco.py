@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,16 +142,40 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         raised = raise_compliance(problem) if is_stiff else None
         if raised is not None:
             problem = replace(problem, compliance=raised)
-    moved_by = find_mover(step, before is not None)
     is_stepped = before is not None
     problem.__dict__["engine_step"] = weakref.ref(data), model, np.array(data.qvel), is_stepped
-    if step.m and (moved_by == "acceleration" or is_stiff) and not step.has_noslip:
-        lam = _scale_force(step, data, get_row_scales(blocks))
-        smooth = data.qacc_smooth if change is None else data.qacc_smooth + change
+    if step.m and not step.has_noslip:
+        # Copies of what the step overwrites; the motion is made when it is judged.
+        arrays = data.efc_force.copy(), data.qacc.copy(), data.qacc_smooth.copy()
+        if change is not None:
+            arrays[2][:] += change
         momentum = dt * data.qfrc_constraint if is_stiff else None
-        motion = EngineMotion(lam, dt * (data.qacc - smooth), compliance, moved_by, momentum)
-        problem.__dict__["engine_motion"] = motion
+        how = kept.mj, model, model.opt.integrator, step.is_discrete, is_stepped
+        problem.__dict__["engine_motion"] = partial(
+            _make_motion, how, dt, blocks, arrays, compliance, momentum, is_stiff
+        )
     return problem
+
+
+def _make_motion(
+    how: tuple[Any, ...],
+    dt: float,
+    blocks: Any,
+    arrays: tuple[FloatArray, ...],
+    compliance: FloatArray,
+    momentum: FloatArray | None,
+    is_stiff: bool,
+) -> EngineMotion | None:
+    """Return the motion of a step from copies of efc_force, qacc and qacc_smooth, or None if the forces are judged.
+
+    `how` has the arguments of `find_mover`.
+    """
+    moved_by = find_mover(*how)
+    if moved_by != "acceleration" and not is_stiff:
+        return None
+    force, acceleration, smooth = arrays
+    lam = _divide_by_scale(dt * force, get_row_scales(blocks))
+    return EngineMotion(lam, dt * (acceleration - smooth), compliance, moved_by, momentum)
 
 
 class EngineAnswer(NamedTuple):
@@ -191,7 +216,7 @@ def engine_answer(model: Any, data: Any) -> EngineAnswer:
     scale = get_row_scales(make_blocks(step, data))
     impulse = _scale_force(step, data, scale)
     before = _get_velocity_before(step)
-    moved_by = find_mover(step, before is not None)
+    moved_by = find_mover_of_step(step, before is not None)
     start = data.qvel.copy() if before is None else before
     is_runge_kutta = model.opt.integrator == mj.mjtIntegrator.mjINT_RK4
     if is_runge_kutta or (moved_by == "forces" and before is not None and model.na):
@@ -252,19 +277,22 @@ def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray
     return np.array(data.qvel)
 
 
-def find_mover(step: Step, is_stepped: bool) -> str:
+def find_mover_of_step(step: Step, is_stepped: bool) -> str:
+    """Return `find_mover` of a step."""
+    model = step.model
+    return find_mover(step.cache.mj, model, model.opt.integrator, step.is_discrete, is_stepped)
+
+
+def find_mover(mj: Any, model: Any, integrator: int, is_discrete: bool, is_stepped: bool) -> str:
     """Return "acceleration" if MuJoCo's integrator uses qacc, and "forces" if it uses qfrc_constraint.
 
     They describe the same motion if the solver has converged, and with PGS. Euler's method with damping, `implicit` and
     `implicitfast` solve (M - h dF/dv) a = qfrc_smooth + qfrc_constraint; all other methods use qacc. RK4 uses the qacc
     of each of its four passes: after a step, the rows belong to the last pass, and qacc is the mean of all.
     """
-    model = step.model
-    mj = step.cache.mj
     option, kinds = model.opt, mj.mjtIntegrator
-    if step.is_discrete:
+    if is_discrete:
         return "acceleration"
-    integrator = option.integrator
     if integrator == kinds.mjINT_RK4:
         return "forces" if is_stepped else "acceleration"
     if integrator != kinds.mjINT_EULER:
@@ -321,7 +349,12 @@ def impulse(model: Any, data: Any) -> FloatArray:
 
 def _scale_force(step: Step, data: Any, scale: FloatArray) -> FloatArray:
     """Return dt efc_force (m,) [N s] divided by the factors of the rows."""
-    return np.divide(step.dt * data.efc_force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
+    return _divide_by_scale(step.dt * data.efc_force, scale)
+
+
+def _divide_by_scale(impulse: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return impulses (m,) [N s] divided by the factors of the rows, 0 where the factor is 0."""
+    return np.divide(impulse, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
 def scaling(model: Any, data: Any) -> FloatArray:

@@ -122,7 +122,7 @@ class StepReader:
         mj, model, data = self.mj, self.model, self.data
         after = self.copy(self.start)  # With the same warm start.
         mj.mj_step(model, after)
-        moved_by = single.find_mover(read_step(model, data), False)
+        moved_by = single.find_mover_of_step(read_step(model, data), False)
         return self.build(engine, np.array(after.qvel), moved_by)
 
     def build(self, engine: str, velocity_after: FloatArray, moved_by: str) -> StepRecord:

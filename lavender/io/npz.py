@@ -162,7 +162,7 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         meta["precision"] = problem.precision
     if general is not None and qp is None:
         meta["dof_names"] = general.names
-    motion = problem.__dict__.get("engine_motion")
+    motion = problem.engine_motion
     if motion is not None:
         if impulse is None or not np.array_equal(arrays["impulse"], motion.impulse):
             arrays["engine_impulse"] = motion.impulse

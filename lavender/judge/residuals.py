@@ -493,12 +493,8 @@ def residual(
     if type(impulse) is np.ndarray:  # The caller may change it before `islands` is read.
         impulse = impulse.copy()
     result = measure_residual(problem, impulse, precision, threshold, tol)
-    motion = problem.__dict__.get("engine_motion")  # `lavender.io.engine_motion.EngineMotion`
-    if (
-        motion is not None
-        and not result.at_floor
-        and np.array_equal(motion.impulse, result._impulse)
-    ):
+    motion = None if result.at_floor else problem.engine_motion
+    if motion is not None and np.array_equal(motion.impulse, result._impulse):
         result = motion.judge(problem, result)
     return result
 

@@ -446,10 +446,19 @@ class ProblemData:
 
     __hash__ = None  # type: ignore[assignment]
 
+    @property
+    def engine_motion(self) -> Any:
+        """The `lavender.io.engine_motion.EngineMotion` of an engine's step, made at its first use; None without one."""
+        motion = self.__dict__.get("engine_motion")
+        if callable(motion):
+            motion = self.__dict__["engine_motion"] = motion()
+        return motion
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles hold the fields, and the motion of an engine that `residual` judges: derived values are
         # computed again, and arrays stay read-only.
-        state = {k: v for k, v in self.__dict__.items() if k == "engine_motion"}
+        motion = self.engine_motion
+        state = {} if motion is None else {"engine_motion": motion}
         values = tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
         return type(self), values, state
 

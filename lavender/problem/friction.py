@@ -16,6 +16,7 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError, check_name
 from lavender_ext.core import blocks as kernels
+from lavender_ext.judge import measure
 
 *_, BOX_KIND, _, ELLIPSE_KIND = kernels.KINDS
 
@@ -116,23 +117,5 @@ def project_impulse(cones: Any, impulse: FloatArray) -> FloatArray:
         return cones.stretch * project_impulse(
             cones.ellipses_replaced_by_disks, impulse / cones.stretch
         )
-    out: FloatArray = np.clip(impulse, cones.lower, cones.upper)
-    first = cones.ptr[:-1]
-    tangents = cones.n_together
-    groups = [
-        (tangents == width, first + 1, width)
-        for width in range(1, int(tangents.max(initial=0)) + 1)
-    ]
-    groups += [
-        (rows >= 0, rows, width)
-        for rows, width in ((cones.separate_rows, 1), (cones.rolling_rows, 2))
-    ]
-    for has_component, first_row, width in groups:
-        rows = first_row[has_component][:, None] + np.arange(width)
-        bound = (cones.friction_coefficient[rows[:, 0]] * out[first[has_component]])[:, None]
-        if width == 1:
-            out[rows] = np.clip(out[rows], -bound, bound)
-        else:
-            size = np.hypot.reduce(out[rows], axis=1)[:, None]
-            out[rows] *= np.divide(bound, size, out=np.ones_like(size), where=size > bound)
+    out: FloatArray = measure.project_impulse_on_bounds(cones._blocks, impulse)
     return out

@@ -42,6 +42,13 @@ cdef inline void project_on_bounds(const blocks_t* p, double* lam) noexcept nogi
             project_block_on_bounds(p, i, 1.0 + 8.0 * unit_roundoff(), lam)
 
 
+cdef inline void project_all_on_bounds(const blocks_t* p, double* lam) noexcept nogil:
+    """Project lam (m) on its bounds, round cones too, radially; numbers that are not finite stay."""
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        project_block_on_bounds(p, i, 1.0, lam)
+
+
 cdef inline bint project_far_excess(const blocks_t* p, double* lam, double* before) noexcept nogil:
     """Project lam (m) on its bounds if a number exceeds them by more than 1e-6 of itself; return whether it was.
 

@@ -15,7 +15,8 @@ from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.bounds cimport project_far_excess, project_on_bounds
+from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.judge.bounds cimport project_all_on_bounds, project_far_excess, project_on_bounds
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.best cimport (begin_at_better_point, best_workspace_size, best_t, bind_best, copy_island_impulse,
                                       copy_score_without_islands, count_islands, seems_without_solution,
@@ -517,6 +518,15 @@ cdef class BestImpulse:
     def impulse(self):
         """The best impulse (m,) [N s], a new array."""
         return np.array(self.x[:self.p.blocks.n_rows])
+
+
+def project_impulse_on_bounds(Blocks blocks, impulse):
+    """Return an impulse (m,) [N s] projected by `project_all_on_bounds`, as a new array."""
+    out = np.array(impulse, float)
+    cdef double* lam = as_double_pointer(out, blocks.at.n_rows)
+    with nogil:
+        project_all_on_bounds(&blocks.at, lam)
+    return out
 
 
 def project_far_excess_of(Data p, impulse):
