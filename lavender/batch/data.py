@@ -400,6 +400,11 @@ class Batch(Sequence[Problem]):
         columns = [self.at[name] for name in ("block", "blocks", "cone_row", "row")]
         return np.stack([*columns, _compute_offsets(self.at["blocks"])], axis=1)
 
+    def stack_free_velocities(self) -> FloatArray:
+        """Return v* of all worlds (n, nv) [m/s, rad/s] of a stacked batch, in float64."""
+        nv = self.velocity_shape[1]
+        return self._arrays[2][self.at["free"][:, None] + np.arange(nv)].astype(float)
+
     def _get_keys_of_world(self, i: int) -> np.ndarray | None:
         """Return the keys of the blocks (k,) of world i, or None."""
         if self.key is None:

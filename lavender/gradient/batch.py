@@ -9,10 +9,12 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_sequence, resolve_index
 from lavender.base.errors import InputError
+from lavender.batch.data import Batch
 from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient, GradientArrays
 from lavender.gradient.system import MAX_KERNEL_ROWS
+from lavender.gradient.worlds import WorldDerivatives
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -130,19 +132,21 @@ class Derivatives(_PerProblem):
         return Gradients(self, numbers, separate)
 
 
-def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Derivatives:
+def derivatives(
+    problems: Batch | Iterable[Problem], solutions: Any
+) -> Derivatives | WorldDerivatives:
     """Prepare the derivative of each of many problems; problems with J and M are prepared by one compiled call.
 
     Parameters
     ----------
-    problems : iterable of Problem
+    problems : Batch, or iterable of Problem
     solutions : iterable of Solution, or (m,) N s
-        One for each problem, for example from `solve_many`.
+        One for each problem, for example from `solve_many`. For a batch also an array of its shape.
 
     Returns
     -------
-    Derivatives
-        A sequence; its `vjp` takes cotangents of all problems.
+    Derivatives, or WorldDerivatives of a batch
+        A sequence; its `vjp` takes cotangents of all problems, for a batch as arrays of its shapes.
 
     Raises
     ------
@@ -154,6 +158,8 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         raise InputError(
             "problems is one Problem; a list of problems is needed, or `lavender.derivative`"
         )
+    if type(problems) is Batch and not problems.cones.has_ellipse:
+        return WorldDerivatives(problems, problems.flatten_impulses("solutions", solutions))
     problems = check_sequence("problems", problems, "Problems")
     is_batch = isinstance(solutions, Solutions) and not solutions.faults
     impulses: Any = solutions

@@ -6,8 +6,8 @@ the impulses of the solution are arguments of the adjoint.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from math import prod
 from typing import Any
@@ -16,9 +16,9 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
+from lavender.batch.data import Batch
 from lavender.batch.solve import solve_many
 from lavender.gradient import derivatives
-from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
 ARGUMENTS = ("J", "M", "v_free", "mu", "target", "compliance")
@@ -38,33 +38,31 @@ class Step:
     solver: str
     tol: float
 
-    def iterate_problems(self, arrays: Sequence[FloatArray]) -> Iterator[Problem]:
-        """Yield the problem of each member of the batch, in C order."""
+    def make_batch(self, arrays: Sequence[FloatArray]) -> Batch:
+        """Return the members of the batch, in C order, as worlds."""
+        jac, mass, free, mu, target, compliance = arrays
         is_contact = self.cones.is_contact
-        for jac, mass, free, mu, target, compliance in zip(*arrays, strict=True):
-            cones = self.cones
-            if is_contact.any():
-                mu_of_block = cones.mu.copy()
-                mu_of_block[is_contact] = mu
-                cones = replace(cones, mu=mu_of_block)
-            yield Problem.from_jacobian(
-                jac,
-                mass,
-                free,
-                target=target,
-                cones=cones,
-                compliance=compliance,
-                friction=self.friction,
-            )
+        mu_of_block = np.repeat(self.cones.mu[None], len(jac), axis=0)
+        mu_of_block[:, is_contact] = mu
+        return Batch(
+            jac,
+            mass,
+            free,
+            target=target,
+            cones=self.cones,
+            compliance=compliance,
+            mu=mu_of_block,
+            friction=self.friction,
+        )
 
     def forward(self, *arrays: Any) -> tuple[FloatArray, FloatArray]:
         """Compute velocities (..., nv) and impulses (..., m)."""
         flat, batch = _flatten_batch(arrays)
-        problems = list(self.iterate_problems(flat))
-        solutions = [s.raise_for_status() for s in solve_many(problems, self.solver, tol=self.tol)]
-        impulse = np.array([s.impulse for s in solutions]).reshape(*batch, self.cones.n_rows)
-        velocity = [p.velocity(s.impulse) for p, s in zip(problems, solutions, strict=True)]
-        return np.array(velocity).reshape(*batch, flat[0].shape[-1]), impulse
+        solutions = solve_many(self.make_batch(flat), self.solver, tol=self.tol)
+        for i in np.flatnonzero(~solutions.success).tolist():
+            solutions[i].raise_for_status()
+        impulse = solutions.impulse.reshape(*batch, self.cones.n_rows)
+        return solutions.velocity.reshape(*batch, flat[0].shape[-1]), impulse
 
     def backward(self, needed: Any, *arrays: Any) -> tuple[FloatArray, ...]:
         """Compute the gradients by the arrays of `forward`.
@@ -79,25 +77,21 @@ class Step:
         """
         arguments = arrays[: len(ARGUMENTS)]
         flat, batch = _flatten_batch(arguments)
-        gradients: list[list[FloatArray]] = [[] for _ in ARGUMENTS]
         sizes = ((x, x.shape[-1]) for x in arrays[len(arguments) :])
         impulses, y, c = (np.broadcast_to(x, (*batch, n)).reshape(prod(batch), n) for x, n in sizes)
-        problems = list(self.iterate_problems(flat))
-        for p, g in zip(
-            problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True
-        ):
-            for out, name, is_needed, like in zip(gradients, ARGUMENTS, needed, flat, strict=True):
-                if not is_needed:
-                    out.append(np.zeros(like.shape[1:]))
-                elif name == "mu":
-                    out.append(g.mu[p.cones.is_contact])
-                else:
-                    out.append(g.full(name) if name in ("J", "M") else getattr(g, name))
+        of_batch = derivatives(self.make_batch(flat), impulses).vjp(velocity=y, impulse=c)
+        gradients = []
+        for name, is_needed, like in zip(ARGUMENTS, needed, flat, strict=True):
+            if not is_needed:
+                gradients.append(np.zeros(like.shape))
+            elif name == "mu":
+                by_block = of_batch.mu.reshape(len(like), self.cones.n_blocks)
+                gradients.append(by_block[:, self.cones.is_contact])
+            else:
+                gradients.append(getattr(of_batch, name))
         shapes = ((x.shape[1:], np.shape(like)) for x, like in zip(flat, arguments, strict=True))
         parts = zip(gradients, shapes, strict=True)
-        return tuple(
-            _sum_to_shape(np.array(x).reshape(*batch, *own), shape) for x, (own, shape) in parts
-        )
+        return tuple(_sum_to_shape(x.reshape(*batch, *own), shape) for x, (own, shape) in parts)
 
 
 def _flatten_batch(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:

@@ -19,6 +19,7 @@ from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, 
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.checks cimport make_instance
 from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, read_clock, reading_interval
+from lavender_ext.core.generalized cimport solve_mass_matrix
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
@@ -26,6 +27,7 @@ from lavender_ext.core.validate cimport all_finite
 from lavender_ext.small.call cimport derive_small_problem, judge_task, solve_small
 from lavender_ext.small.task cimport (N_CALL_WORKSPACES, N_COUNTS, RESULT_FAILED, RESULT_IS_START, WORK, count_task_scratch,
                                       small_rules_t, task_t)
+from lavender_ext.batch.adjoint cimport adjoin_task, adjoint_t, cotangents_t
 from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve_task
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
@@ -713,8 +715,77 @@ cdef class Worlds:
         self.number[RHS_ENERGY * (self.w.n + 1) + i] = compute_rhs_energy_norm(&j.v.p)
         return READY
 
+    cdef bint adjoin_world(self, int64_t i, worker_t* h, int32_t max_rows, double max_residual,
+                           const double** y, double** out) noexcept nogil:
+        """Compute the results of `adjoin_task` of world i; y (3) are cotangents of all worlds or NULL, out (6) the results."""
+        cdef task_t j
+        cdef cotangents_t of_world
+        cdef adjoint_t results
+        cdef const int64_t* at = self.w.at + i * PLACES
+        cdef int64_t r = at[AT_ROW], v = at[VELOCITY]
+        cdef int32_t k
+        cdef bint is_done
+        if self.tasks != NULL or self.convert_world(i, h, &j) != READY:
+            return False
+        of_world.velocity = y[0] + v if y[0] != NULL else NULL
+        of_world.impulse = y[1] + r if y[1] != NULL else NULL
+        of_world.slack = y[2] + r if y[2] != NULL else NULL
+        results.q, results.s, results.e = out[0] + r, out[1] + r, out[2] + r
+        results.f, results.p, results.change = out[3] + v, out[4] + v, out[5] + v
+        if j.v.p.n_rows == 0:                           # v+ = v*
+            for k in range(at[VELOCITIES]):
+                results.f[k] = results.p[k] = of_world.velocity[k] if of_world.velocity != NULL else 0.0
+            solve_mass_matrix(&j.g, results.p)
+            return True
+        is_done = adjoin_task(&j, h.at, j.lam, max_rows, max_residual, &of_world, &results)
+        h.made = j.made                                 # The next world reuses the memory of `made`.
+        return is_done
+
     def __dealloc__(self):
         free(self.tasks)
+
+
+def adjoin_worlds(Worlds worlds, int32_t max_rows, double max_residual, cotangents, results):
+    """Compute the results of `adjoint.pxd` (1) at the starts of worlds that are given by arrays.
+
+    Parameters
+    ----------
+    worlds : Worlds
+    max_rows : int
+        Largest system that is factored.
+    max_residual : float, -
+        Largest relative residual of a solution.
+    cotangents : sequence of 3
+        Flat arrays of all worlds, by v+, lambda and w, or None.
+    results : sequence of 6
+        Flat arrays for q, s, e of all rows and f, p, v' of all velocities, filled with zeros.
+
+    Returns
+    -------
+    list of int
+        Worlds that the caller must differentiate by themselves.
+    """
+    cdef Worker worker = Worker(worlds, b"\0")
+    cdef const double* y[3]
+    cdef double* out[6]
+    cdef int64_t i, n = worlds.w.n
+    cdef int32_t k
+    cdef list left = []
+    cdef Py_ssize_t rows = worlds.impulse.size, velocities = worlds.velocity.size
+    for k in range(3):
+        y[k] = NULL
+        if cotangents[k] is not None:
+            y[k] = as_double_pointer(cotangents[k], rows if k else velocities)
+    for k in range(6):
+        out[k] = as_double_pointer(results[k], rows if k < 3 else velocities)
+    for i in range(n):
+        with nogil:
+            k = worlds.adjoin_world(i, &worker.h, max_rows, max_residual, y, out)
+        if not k:
+            left.append(i)
+        if i % INTERRUPT_CHECK_WORLDS == 0:
+            PyErr_CheckSignals()
+    return left
 
 
 cdef class Worker:

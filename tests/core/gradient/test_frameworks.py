@@ -22,7 +22,7 @@ def arrays(seed, contacts=2, tangents=2, nv=5):
 def is_smooth(given):
     made = make_step(given, None, "coulomb", "auto", 1e-12)
     _, impulse = made.forward(*given)
-    problem = next(made.iterate_problems([x[None] for x in given]))
+    problem = made.make_batch([x[None] for x in given])[0]
     return float(lv.derivative(problem, impulse).distance.min()) > 1e-2
 
 

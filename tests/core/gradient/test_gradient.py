@@ -218,11 +218,12 @@ def test_derivatives_of_a_stacked_batch_equal_single_ones_and_reject_other_solut
     found = lv.derivatives(batch, solutions).vjp(velocity=np.ones((3, 7)))
     for i, g in enumerate(found):
         alone = lv.derivative(batch[i], solutions[i]).vjp(velocity=np.ones(7))
-        assert np.array_equal(g.b, alone.b) and np.array_equal(
-            found.v_free[7 * i : 7 * i + 7], alone.v_free
-        )
+        assert np.array_equal(g.b, alone.b) and np.array_equal(found.v_free[i], alone.v_free)
+        assert np.array_equal(found.b[i, : len(g.b)], alone.b)
     with pytest.raises(lv.InputError, match="problem 0: the impulse is not a solution"):
         lv.derivatives(batch[::-1], solutions)
+    with pytest.raises(lv.InputError, match="world 0: the impulse is not a solution"):
+        lv.derivatives(batch, 0.9 * solutions.impulse).vjp(velocity=np.ones((3, 7)))
     assert (
         len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
     )
@@ -343,3 +344,78 @@ def test_derivative_by_one_of_several_redundant_rows_raises():
         with pytest.raises(lv.CapabilityError, match="share a load"):
             refused()
     assert d.jvp(mu=np.ones(4)).velocity[0] < 0.0
+
+
+def make_worlds(law, contacts, nv, twice=False, change=0.0):
+    """Return eight stacked worlds; with `twice` a contact of world 1 is given twice, so that A is singular."""
+    rng = np.random.default_rng(contacts)
+    jac = rng.standard_normal((8, 3 * contacts, nv))
+    if twice:
+        jac[1, -3:] = jac[1, -6:-3]
+    half = rng.standard_normal((8, nv, nv))
+    return lv.Batch(
+        jac,
+        0.1 * half @ half.transpose(0, 2, 1) + np.eye(nv),
+        rng.standard_normal((8, nv)) + change,
+        target=0.1 * rng.standard_normal((8, 3 * contacts)),
+        compliance=None if twice else rng.uniform(0.0, 0.1, (8, 3 * contacts)),
+        mu=rng.uniform(0.2, 1.0, (8, contacts)),
+        cones=lv.Cones.contacts(0.5, count=contacts),
+        friction=law,
+    )
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize(
+    ("contacts", "nv", "twice"), [(1, 6, False), (4, 18, False), (10, 36, False), (3, 9, True)]
+)
+def test_gradients_of_worlds_equal_those_of_single_problems(law, contacts, nv, twice):
+    batch = make_worlds(law, contacts, nv, twice)
+    rng = np.random.default_rng(1)
+    solutions = lv.solve_many(batch, tol=1e-12)
+    shapes = {"velocity": batch.velocity_shape, "impulse": batch.shape, "slack": batch.shape}
+    cotangents = {name: rng.standard_normal(shape) for name, shape in shapes.items()}
+    if twice:
+        cotangents = {"velocity": cotangents["velocity"]}
+    found = lv.derivatives(batch, solutions).vjp(**cotangents)
+    for i in range(8):
+        own = {name: x[i] for name, x in cotangents.items()}
+        alone = lv.derivative(batch[i], solutions[i]).vjp(**own)
+        for name in ("v_free",) if twice else ("b", "target", "v_free", "mu", "compliance"):
+            assert np.array_equal(getattr(found, name)[i], getattr(alone, name)), name
+        for name in () if twice else ("J", "M"):
+            # 1e-14: the order of the terms of an entry.
+            np.testing.assert_allclose(
+                getattr(found, name)[i], alone.full(name), rtol=1e-14, atol=1e-14
+            )
+        assert np.array_equal(found[i].v_free, alone.v_free)
+
+
+def test_gradients_of_worlds_agree_with_differences():
+    batch = make_worlds("coulomb", 2, 6)
+    y = np.random.default_rng(2).standard_normal((8, 6))
+    found = lv.derivatives(batch, lv.solve_many(batch, tol=1e-13)).vjp(velocity=y)
+    step = 1e-6
+    rng = np.random.default_rng(3)
+    direction = rng.standard_normal((8, 6))
+    total = []
+    for sign in (1.0, -1.0):
+        moved = make_worlds("coulomb", 2, 6, change=sign * step * direction)
+        total.append((y * lv.solve_many(moved, tol=1e-13).velocity).sum(axis=1))
+    differences = (total[0] - total[1]) / (2.0 * step)
+    # 1e-6: the error of central differences, unless a contact changes its state between both ends.
+    close = np.isclose((found.v_free * direction).sum(axis=1), differences, rtol=1e-6, atol=1e-7)
+    assert close.sum() >= 7
+
+
+def test_cotangents_of_worlds_are_checked():
+    batch = make_worlds("cone", 1, 6)
+    of = lv.derivatives(batch, lv.solve_many(batch, tol=1e-12))
+    with pytest.raises(lv.InputError, match=r"velocity has shape \(8, 5\)"):
+        of.vjp(velocity=np.ones((8, 5)))
+    with pytest.raises(lv.InputError, match="None"):
+        of.vjp()
+    bad = np.ones((8, 6))
+    bad[3, 2] = np.nan
+    with pytest.raises(lv.InputError, match="world 3"):
+        of.vjp(velocity=bad)
