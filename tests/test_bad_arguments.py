@@ -440,6 +440,9 @@ CALLS["Batch.flatten_impulses"] = Call(
     {"given": np.ones((2, 2))},
     accepts_nan=True,
 )
+CALLS["Batch.make_start"] = Call(
+    lambda given: BATCH.make_start((BATCH, given)), {"given": np.ones((2, 2))}, accepts_nan=True
+)
 add(
     {
         "problems": BATCH,
