@@ -28,6 +28,7 @@ NAMES = (
     "score",
     "stability",
     "stand",
+    "worlds",
 )
 
 
