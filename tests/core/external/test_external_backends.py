@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -232,20 +233,70 @@ def test_backend_beyond_its_time_limit_is_ended_and_the_next_call_starts_another
     assert after.success and "ran in a separate process" in after.message
 
 
+def end_idle_processes():
+    from lavender.external.isolated import idle_processes, is_starting_spare
+
+    deadline = time.monotonic() + 60.0
+    while is_starting_spare() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    while idle_processes:
+        idle_processes.pop().close()
+
+
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
 def test_isolated_process_is_reused_and_replaced_after_its_death():
     from lavender.external.isolated import idle_processes
 
     problem = lv.Problem.lcp(*spd(5))
+    end_idle_processes()
     lv.solve(problem, APART[0], time_limit=600.0)
     (process,) = idle_processes
     before = process.popen
     lv.solve(problem, APART[0], time_limit=600.0)
-    assert idle_processes == [process] and process.popen is before
+    assert process in idle_processes and process.popen is before
     before.kill()
     before.wait()
     assert lv.solve(problem, APART[0], time_limit=600.0).success
-    assert idle_processes == [process] and process.popen is not before
+    assert process in idle_processes and process.popen is not before
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_isolated_process_goes_on_beyond_a_limit_and_serves_later_calls(monkeypatch):
+    from lavender.external import isolated
+
+    monkeypatch.setattr(isolated, "MAX_OVERRUN", 600.0)
+    monkeypatch.setattr(isolated, "START_TIME", 600.0)
+    end_idle_processes()
+    large, small = lv.Problem.lcp(*spd(400, seed=3)), lv.Problem.lcp(*spd(5))
+    lv.solve(small, APART[0], time_limit=300.0)
+    (process,) = isolated.idle_processes
+    before = process.popen
+    monkeypatch.setattr(isolated, "MAX_OVERRUNNING", 0)  # No other process is started.
+    late = lv.prepare(large, APART[0]).solve(time_limit=1e-6)
+    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
+    deadline = time.monotonic() + 60.0
+    while process.is_busy and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert lv.solve(small, APART[0], time_limit=300.0).success
+    assert isolated.idle_processes == [process] and process.popen is before
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_isolated_process_that_goes_on_for_long_is_killed_and_replaced(monkeypatch):
+    from lavender.external import isolated
+
+    monkeypatch.setattr(isolated, "MAX_OVERRUN", 0.01)
+    end_idle_processes()
+    process = isolated.Process()
+    with pytest.raises(TimeoutError):
+        process.call_function(time.sleep, 600.0, timeout=0.05)
+    isolated.idle_processes.append(process)
+    deadline = time.monotonic() + 60.0
+    while process in isolated.idle_processes and time.monotonic() < deadline:
+        time.sleep(0.01)
+    while isolated.is_starting_spare() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert process.popen is None and len(isolated.idle_processes) == 1
 
 
 @pytest.mark.parametrize("name", installed("clarabel", "osqp"))

@@ -273,3 +273,17 @@ def test_error_of_scaled_integer_programs_is_judged_in_fractions():
                 n_found += 1
                 np.testing.assert_allclose(answer.x * unit, exact, rtol=1e-6, atol=1e-8)
     assert n_found >= 30
+
+
+@pytest.mark.parametrize("solver", ["newton", "pgs", "nncg", "admm"])
+def test_own_solver_searches_no_proof_on_feasible_programs(solver, monkeypatch):
+    def fail(*arguments, **options):
+        raise AssertionError("a linear program was solved")
+
+    monkeypatch.setattr("lavender.external.proofs._solve_linear_program", fail)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        half, G, inside = (rng.normal(size=size) for size in ((20, 20), (30, 20), 20))
+        arrays = {"P": half @ half.T + np.eye(20), "q": rng.normal(size=20), "G": G}
+        answer = lv.solve_qp(**arrays, h=G @ inside + rng.random(30), solver=solver)
+        assert answer.found or answer.error < 1e-4
