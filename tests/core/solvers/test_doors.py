@@ -139,35 +139,39 @@ def make_program():
     }  # fmt: skip
 
 
-class QpsolversProblem:
-    """The attributes of `qpsolvers.Problem`."""
-
-    def __init__(self, arrays):
-        vars(self).update(arrays)
-
-    def unpack(self):
-        return tuple(vars(self)[name] for name in ("P", "q", "G", "h", "A", "b", "lb", "ub"))
-
-
+#: Doors that return the package's answer.
 PROGRAM_DOORS = {
-    "lv.solve_qp, arrays": lambda p, **more: lv.solve_qp(**p, **more),
-    "lv.solve_qp, positions": lambda p, **more: lv.solve_qp(*p.values(), **more),
-    "lv.solve_qp, a problem": lambda p, **more: lv.solve_qp(lv.Problem.from_qp(**p), **more),
-    "qp.solve_problem, a problem": lambda p, **more: lv.qp.solve_problem(lv.Problem.from_qp(**p), **more),
-    "qp.solve_qp": lambda p, **more: lv.qp.solve_qp(**p, **more),
-}  # fmt: skip
+    "arrays by position": lambda p, **more: lv.solve_qp(*p.values(), **more),
+    "a problem": lambda p, **more: lv.solve_qp(lv.Problem.from_qp(**p), **more),
+    "lavender.qp.solve_problem": lambda p, **more: lv.qp.solve_problem(
+        lv.Problem.from_qp(**p), more.pop("solver", "auto"), **more
+    ).extras["answer"],
+}
 
 
-@pytest.mark.parametrize("more", [{}, {"tol": 1e-3}, {"tol": 1e-11}, {"max_iter": 4}, {"solver": "admm"},
-                                  {"solver": "admm", "max_iter": 3}, {"time_limit": 1e-9}])  # fmt: skip
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"tol": 1e-3},
+        {"tol": 1e-11},
+        {"max_iter": 4},
+        {"solver": "admm"},
+        {"solver": "admm", "max_iter": 3},
+        {"time_limit": 1e-9},
+    ],
+)
 def test_keyword_of_a_program_has_one_meaning_through_every_door(more):
-    """The doors of qpsolvers have another default of tol, and `solve_qp` of these returns x alone."""
-    arrays = make_program()
-    answers = {name: door(arrays, **{"tol": 1e-7} | more) for name, door in PROGRAM_DOORS.items()}
-    expected = answers.pop("lv.solve_qp, arrays")
-    x = answers.pop("qp.solve_qp")
-    if "time_limit" not in more:  # What a limit cuts off depends on the clock.
-        for name, answer in answers.items():
+    """The doors of qpsolvers have another default of tol, and their `solve_qp` returns x alone, or None."""
+    arrays, more = make_program(), {"tol": 1e-7} | more
+    expected = lv.solve_qp(**arrays, **more)
+    answers = {name: door(arrays, **more) for name, door in PROGRAM_DOORS.items()}
+    for name, answer in answers.items():
+        assert (answer.found, answer.solution.status) == (
+            expected.found,
+            expected.solution.status,
+        ), name
+        if "time_limit" not in more:  # What a limit cuts off depends on the clock.
             for part in ("x", "y", "z", "z_box"):
                 assert getattr(answer, part).tobytes() == getattr(expected, part).tobytes(), (
                     name,
@@ -175,11 +179,7 @@ def test_keyword_of_a_program_has_one_meaning_through_every_door(more):
                 )
             assert answer.error == expected.error, name
             assert answer.solution.iterations == expected.solution.iterations, name
-    for name, answer in answers.items():
-        assert (answer.found, answer.solution.status) == (
-            expected.found,
-            expected.solution.status,
-        ), name
+    x = lv.qp.solve_qp(**arrays, **({"solver": "auto"} | more))
     assert (x is not None) == expected.found and (x is None or x.tobytes() == expected.x.tobytes())
 
 
