@@ -297,14 +297,14 @@ def get_class(row):
 
 
 def count_changes(rows, before, after):
-    """Return how many cells have a better and a worse class in the second of two columns."""
+    """Return how many cells have a better and a worse class in the second of two columns, without slow ones."""
     pairs = [
         [get_class(find(rows, name, column, scene)) for column in (before, after)]
         for name in get_engines(rows)
         for scene in SCENES
         if not (SCENES[scene].own_rates and before[0] == after[0])
     ]
-    pairs = [pair for pair in pairs if None not in pair]
+    pairs = [pair for pair in pairs if None not in pair and 4 not in pair]
     return sum(b < a for a, b in pairs), sum(b > a for a, b in pairs)
 
 
@@ -364,7 +364,7 @@ def make_findings(rows):
         f"{hard:.1g}, noslip as well {noslip:.1g}.",
         "Rest": f"{join_names(asleep, rows)} leave the slab of `slip` at rest by default; {join_names(awake, rows)} "
         f"{'is' if len(awake) == 1 else 'are'} right with accurate settings.",
-        "One friction point": f"{join_names(apart, rows)} stop the cube of `slide` rightly and that of `spin`, which "
+        "Slide and turn": f"{join_names(apart, rows)} stop the cube of `slide` rightly and that of `spin`, which "
         "turns as well, wrongly.",
         "Repeated cells": f"equal errors in {len(repeated) - differ} of {len(repeated)}.",
     }

@@ -441,7 +441,7 @@ ENGINES: Mapping[str, Entry] = {
         {
             "substeps": "collision steps divide the time step",
             "stiffness": _RIGID,
-            "friction": "a round cone at each point as shipped",
+            "friction": NO_KNOB,
             "slip": NO_KNOB,
         },
         node=True,
