@@ -353,12 +353,13 @@ def make_findings(rows):
     differ = sum(row.spread != 0.0 for row in repeated)
     verb = "are" if " and " in best else "is"
     own = f"{count('lavender', default)} and {count('lavender', accurate)}"
+    shared = f"{most} and {most_accurate}"
     found = {
         "Settings against time step": f"accurate settings change the class of {better} cells for the better and of "
         f"{worse} for the worse; the finer step then {finer} and {coarser}.",
         "By default": f"{best} {verb} good or fair in most scenes, {most} of {len(SCENES)}; with accurate settings at "
         f"the same step {best_accurate}, {most_accurate}."
-        + (f" LavenderSim: {own}." if "lavender" in names else ""),
+        + (f" LavenderSim: {own}." if "lavender" in names and own != shared else ""),
         "MuJoCo": f"by default a slab below the friction angle slides at {error('mujoco', 'stick', default):.2g} m/s: "
         f"its friction is a pyramid. A round cone with impratio 100 leaves {soft:.1g} m/s, stiff contacts as well "
         f"{hard:.1g}, noslip as well {noslip:.1g}.",
