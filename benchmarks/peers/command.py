@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import click
 
 from benchmarks.output import out_option, write_json
+from benchmarks.peers import box3d as peer_box3d
 from benchmarks.peers import engines as peer_engines
 from benchmarks.peers import race
 from benchmarks.peers.adapters import Result, contestants, ours
@@ -67,6 +69,12 @@ PACKAGES = (
     metavar="PYTHON",
     help="Interpreter that has Siconos (Debian: python3-siconos).",
 )
+@click.option(
+    "--box3d",
+    type=click.Path(path_type=Path),
+    metavar="CHECKOUT",
+    help="Checkout of github.com/erincatto/box3d, built by CMake: compare its steps only.",
+)
 @out_option("Write every run here too, JSON.")
 def command(
     files: tuple[str, ...],
@@ -77,6 +85,7 @@ def command(
     limit: float,
     rounds: int,
     siconos: str,
+    box3d: Path | None,
     out: Path | None,
 ) -> None:
     """Compare engines on the same scenes and solvers on the same problems: ratios of times, and errors.
@@ -87,6 +96,17 @@ def command(
     def note(text: str) -> None:
         click.echo(text, err=True)
 
+    if box3d is not None:
+        with TemporaryDirectory() as folder:
+            program = peer_box3d.build(box3d, Path(folder))
+            beside = []
+            for scene in peer_box3d.SCENES:
+                note(scene)
+                beside.append(peer_box3d.measure(program, scene))
+        click.echo(peer_box3d.format_table(beside))
+        if out is not None:
+            write_json(out, beside)
+        return
     steps: list[Step] = []
     found: list[Result] = []
     versions = machine.get_versions(PACKAGES)

@@ -3,12 +3,13 @@
 import importlib.util
 import json
 import math
+import sys
 
 import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks.peers import adapters, engines
+from benchmarks.peers import adapters, box3d, engines
 from benchmarks.peers import tables as comparison
 from benchmarks.peers.adapters import ours
 from benchmarks.peers.command import command
@@ -79,3 +80,31 @@ def test_bench_peers_command_steps_one_scene_in_every_engine_and_keeps_losses(
     lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
     assert done.output.count("- stack6: ") == len(lost)
     assert all(f"- stack6: {s.engine}," in done.output for s in lost)
+
+
+STEADY = """#!{python}
+import sys
+dt, substeps, friction, n = sys.stdin.readline().split()
+boxes = [sys.stdin.readline().split()[:3] for _ in range(int(n))]
+for steps in sys.stdin:
+    print(2e-3 * int(steps), *(x for box in boxes for x in box), flush=True)
+"""
+
+
+def test_bench_peers_box3d_gets_the_scene_and_is_timed_beside_lavender(tmp_path):
+    # A program with the interface of box3d_steps.c, in which nothing moves and a step takes 2 ms.
+    program = tmp_path / "steady"
+    program.write_text(STEADY.format(python=sys.executable), encoding="utf-8")
+    program.chmod(0o755)
+    found = box3d.measure(program, "tower 6", rounds=2)
+    assert found.time[1] == pytest.approx(2e-3) and found.ratio == pytest.approx(
+        found.time[0] / 2e-3, rel=0.5
+    )
+    assert (found.lateral[1], found.vertical[1]) == (0.0, 0.0)
+    assert 0.0 < found.vertical[0] < 1e-3  # m, the slop that LavenderSim allows
+    assert "| tower 6 |" in box3d.format_table([found])
+
+
+def test_bench_peers_box3d_needs_a_checkout(tmp_path):
+    result = CliRunner().invoke(command, ["--box3d", str(tmp_path)])
+    assert result.exit_code and "checkout" in str(result.exception)
