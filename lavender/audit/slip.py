@@ -237,8 +237,8 @@ class SlipExplanation:
                 f"The order of exchange decides; also: {self._describe_part(ranked[1], i)} {unit}."
             )
         use = None if self.friction_use is None else float(self.friction_use[i])
-        has_force = use is None or not np.isnan(use)
         is_joint = not slip["contact"].startswith("contact")
+        has_force = is_joint or use is None or not np.isnan(use)
         if self.speeds_before is not None:
             before = float(self.speeds_before[i])
             after = float(self.rigid_speeds[i])
@@ -252,7 +252,7 @@ class SlipExplanation:
         if not has_force:
             no_force = "has no normal force at this contact, and therefore no friction"
             lines.append(f"The engine's answer {no_force}.")
-        elif use is not None:
+        elif use is not None and not np.isnan(use):
             limit = "its limit" if is_joint else "mu times the normal force"
             share = f"{100.0 * use:.0f} % of {limit}"
             lines.append(f"In the engine's answer its friction force is {share}.")

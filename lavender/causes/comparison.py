@@ -1,7 +1,7 @@
 """Why two engines make different velocities in one step: parts of the difference by their causes.
 
     a = lavender.io.step_from_mujoco(model, data)
-    b = lavender.io.step_from_genesis(scene, velocity)
+    b = lavender.io.load_step("step.npz")           # of another version or engine
     print(lavender.compare(a, b))
     print(lavender.compare(a))                      # against the rigid laws
 
@@ -23,6 +23,7 @@ solvers leave, sum to the difference:
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -92,12 +93,14 @@ def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
         if not isinstance(record, StepRecord) and not (name == "b" and record is None):
             raise InputError(
                 f"{name} is a {type(record).__name__}; a StepRecord of lavender.io.step_from_mujoco, "
-                "step_from_genesis, step_from_newton_mujoco, step_from_kamino or load_step is needed"
+                "step_from_newton_mujoco or load_step is needed"
             )
     is_ideal = b is None
     if b is None:
         a, b = make_ideal_twin(a), a
     _check_steps(a, b)
+    if a.engine == b.engine:
+        a, b = replace(a, engine=f"first {a.engine}"), replace(b, engine=f"second {b.engine}")
     pairing = Pairing.of_records(a, b)
     solved = Mixtures(a, b, pairing)
     exact_a, whole = solved.solve({}), solved.solve(dict.fromkeys(PARTS, True))

@@ -377,6 +377,14 @@ def _iterate_settings(record: StepRecord) -> Iterator[tuple[str, tuple[str, ...]
     if record.settings.get("family") not in ("mujoco", "genesis"):
         return
 
+    roles = {x.role for x in record.blocks if x.softness.rule == "impedance"}
+    # MJCF has other names for the rows of a joint than for contacts.
+    suffix = (
+        {"friction": "friction", "limit": "limit"}.get(next(iter(roles)), "")
+        if len(roles) == 1
+        else ""
+    )
+
     def soften(**changes: Any) -> StepRecord:
         blocks = tuple(
             replace(x, softness=replace(x.softness, **changes))
@@ -388,10 +396,14 @@ def _iterate_settings(record: StepRecord) -> Iterator[tuple[str, tuple[str, ...]
 
     stiff = np.array([0.99, 0.999, 0.001, 0.5, 2.0])
     short = np.array([2.0 * record.dt, 1.0])
-    yield 'solimp="0.99 0.999 0.001"', ("softness",), soften(solimp=stiff)
-    yield f'solref="{short[0]:g} 1"', ("softness",), soften(solref=short)
+    yield f'solimp{suffix}="0.99 0.999 0.001"', ("softness",), soften(solimp=stiff)
+    yield f'solref{suffix}="{short[0]:g} 1"', ("softness",), soften(solref=short)
     both = soften(solref=short, solimp=stiff)
-    yield f'solref="{short[0]:g} 1" with solimp="0.99 0.999 0.001"', ("softness",), both
+    yield (
+        f'solref{suffix}="{short[0]:g} 1" with solimp{suffix}="0.99 0.999 0.001"',
+        ("softness",),
+        both,
+    )
     if record.settings["family"] == "mujoco":
         discrete = replace(
             record, in_problem=True, implicit_rows=True, uses_damping=True, uses_actuators=True,

@@ -1,15 +1,15 @@
 """Find for each constraint of one step the same constraint in the step of another engine.
 
 Contacts of the same two bodies are matched by their geoms and then by the smallest sum of distances, whatever their
-number of rows; all other constraints by their keys. A contact without a partner borrows the settings of the nearest
-contact of the same bodies in the other engine. A constraint that is not active there has the settings that the other
-engine's model gives it, if they are known.
+number of rows; all other constraints by their keys. A contact without a partner has the settings that the other
+engine's geoms give it, if it has the same geoms, or borrows those of the nearest contact of the same bodies there. A
+constraint that is not active there has the settings that the other engine's model gives it, if they are known.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -69,8 +69,28 @@ class Pairing:
         """Return the block of `source` that is the same as block i of `base`, or lends its settings; else None."""
         if source is base:
             return base.blocks[i]
-        j = self.lenders[self.side_of(base)][i]
+        side = self.side_of(base)
+        if self.partners[side][i] < 0:
+            made = self.make_unmatched(source, base.blocks[i])
+            if made is not None:
+                return made
+        j = self.lenders[side][i]
         return None if j < 0 else source.blocks[j]
+
+    def make_unmatched(self, source: StepRecord, block: ConstraintBlock) -> ConstraintBlock | None:
+        """Return a contact with the settings that `source` would give it; None if its geoms are not known there."""
+        settings = [source.geom_settings[x] for x in block.geoms if x in source.geom_settings]
+        cone = {"pyramidal": "pyramid", "elliptic": "ellipse"}.get(source.settings.get("cone", ""))
+        if block.role != "contact" or len(settings) != 2 or cone is None:
+            return None
+        condim, friction, softness = settings[0].combine(settings[1])
+        return replace(
+            block,
+            condim=condim,
+            cone=cone if condim > 1 else "",
+            friction=friction,
+            softness=softness,
+        )
 
     def find_softness(self, source: StepRecord, base: StepRecord, i: int) -> Softness | None:
         """Return the softness that `source` gives to block i of `base`; None if it is not known."""

@@ -22,7 +22,7 @@ from lavender.io.impedance import compute_compliance, compute_reference
 from lavender.io.mujoco_discrete import compute_discrete_matrix
 from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_step
 from lavender.io.start_states import without_sleep
-from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
+from lavender.io.step_record import ConstraintBlock, GeomSettings, Softness, StepRecord
 
 EQUALITY, FRICTION_DOF, FRICTION_TENDON, LIMIT_JOINT, LIMIT_TENDON = range(5)
 PYRAMIDAL = 6  # Values of mjtConstraint: 5 is a contact without friction, 7 an elliptic one.
@@ -174,7 +174,7 @@ class StepReader:
             names=names, angular=angular, position=np.array(data.qpos),
             acceleration=np.array(data.qacc), moved_by=moved_by,
             before_noslip=self.read_forces_before_noslip(groups), weights=self.read_weights(),
-            softnesses=self.read_softnesses(), settings=self.read_settings(),
+            softnesses=self.read_softnesses(), geom_settings=self.read_geom_settings(), settings=self.read_settings(),
             precision=self.precision,
         )  # fmt: skip
 
@@ -357,6 +357,20 @@ class StepReader:
             key = f"equality {_name(model.equality(i), 'number', i)}"
             result[key] = self.make_softness(model.eq_solref[i], model.eq_solimp[i])
         return result
+
+    def read_geom_settings(self) -> dict[str, GeomSettings]:
+        """Return the contact settings of geoms, unless pairs of geoms have their own."""
+        model = self.model
+        if model.npair:
+            return {}
+        return {
+            name: GeomSettings(
+                int(model.geom_condim[i]), int(model.geom_priority[i]), float(model.geom_solmix[i]),
+                np.array(model.geom_friction[i]),
+                self.make_softness(model.geom_solref[i], model.geom_solimp[i]),
+            )
+            for i, name in enumerate(self.geoms)
+        }  # fmt: skip
 
     def make_softness(self, solref: Any, solimp: Any, friction: Any = (0.0, 0.0)) -> Softness:
         """Return the softness of a row."""

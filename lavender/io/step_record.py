@@ -35,6 +35,7 @@ from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.io.stored import as_path, write_arrays
 
+SMALLEST_MIX = 1e-15  # Smaller weights of a geom's softness count as 0, as in MuJoCo.
 FORMAT = "lavender step record 1"
 
 
@@ -75,6 +76,34 @@ class Softness:
     rate: FloatArray = field(default_factory=lambda: np.zeros(0))
     stiffness: FloatArray = field(default_factory=lambda: np.zeros(0))
     compliance: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class GeomSettings:
+    """The contact settings of a geom, from which MuJoCo makes the ones of a contact that a step does not have."""
+
+    condim: int
+    priority: int
+    mix: float
+    friction: FloatArray  # (3,): sliding, spin, rolling.
+    softness: Softness
+
+    def combine(self, other: GeomSettings) -> tuple[int, FloatArray, Softness]:
+        """Return condim, coefficients (5,) and softness of a contact of two geoms, by MuJoCo's rule."""
+        if self.priority != other.priority:
+            chosen = self if self.priority > other.priority else other
+            return chosen.condim, chosen.friction[[0, 0, 1, 2, 2]], chosen.softness
+        friction = np.maximum(self.friction, other.friction)[[0, 0, 1, 2, 2]]
+        total = self.mix + other.mix
+        share = self.mix / total if total >= SMALLEST_MIX else 0.5
+        if total >= SMALLEST_MIX and min(self.mix, other.mix) < SMALLEST_MIX:
+            share = float(self.mix >= SMALLEST_MIX)
+        x, y = self.softness, other.softness
+        both_standard = x.solref[0] > 0.0 and y.solref[0] > 0.0
+        mixed = share * x.solref + (1.0 - share) * y.solref
+        solref = mixed if both_standard else np.minimum(x.solref, y.solref)
+        solimp = share * x.solimp + (1.0 - share) * y.solimp
+        return max(self.condim, other.condim), friction, replace(x, solref=solref, solimp=solimp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +229,8 @@ class StepRecord:
         Inverse masses of bodies and of other constraints, by body or key.
     softnesses : dict
         Softness by the key of constraints that are not active in this step.
+    geom_settings : dict
+        Contact settings by the name of the geom.
     settings : dict
         Name and value of the engine's settings, for sentences.
     precision : {"float64", "float32"}
@@ -236,6 +267,7 @@ class StepRecord:
     before_noslip: tuple[FloatArray, ...] | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     softnesses: Mapping[str, Softness] = field(default_factory=dict)
+    geom_settings: Mapping[str, GeomSettings] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     precision: str = "float64"
 
@@ -366,7 +398,12 @@ def load_step(path: str | os.PathLike[str]) -> StepRecord:
     return result
 
 
-_CLASSES = {"StepRecord": StepRecord, "ConstraintBlock": ConstraintBlock, "Softness": Softness}
+_CLASSES = {
+    "StepRecord": StepRecord,
+    "ConstraintBlock": ConstraintBlock,
+    "Softness": Softness,
+    "GeomSettings": GeomSettings,
+}
 
 
 def _flatten(value: Any, arrays: dict[str, Any]) -> Any:

@@ -444,3 +444,16 @@ def test_slip_follows_two_bodies_whose_geoms_take_turns():
                 mujoco.mj_step(changed, data)
         assert remedy.touching == pytest.approx(np.mean(touches)), remedy.setting
     assert "states keep contact" not in "".join(worst.advice)
+
+
+def test_stop_that_returns_more_than_the_approach_is_softness():
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody><body>
+      <joint name="stop" axis="0 0 1" range="-60 60" limited="true" solreflimit="-200000 -20"/>
+      <inertial pos="0 0 0" mass="1" diaginertia=".01 .01 .01"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    data.qpos[0], data.qvel[0] = np.radians(60.1), 3.0
+    mujoco.mj_forward(model, data)
+    explanation = explain_slip(lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data))
+    assert explanation.contacts == ("upper limit of stop",) and explanation.causes == ("softness",)
+    assert not any("normal force" in line for line in explanation.sentences)
+    assert 'solreflimit="0.002 1"' in str(explanation.comparison)

@@ -126,3 +126,25 @@ def test_text_names_the_settings_that_differ_and_checks_what_to_try():
     text = str(lv.compare(a, b))
     assert "solref 0.02 1 and solref 0.03 0.8" in text
     assert 'solref="0.02 1" (solved: the largest difference falls by 100 %' in text
+
+
+def test_contact_that_one_model_lacks_has_the_settings_of_its_geoms_there():
+    """The peg touches the floor only with the margin; without it, its condim there is known by its geoms."""
+    condim = planted.CHANGES["ball"]["condim 3"][0]
+    margin = planted.CHANGES["ball"]["margin"][0]
+    steps = [
+        read("ball", *x, integrator="discrete", cone="elliptic")
+        for x in ((), (condim,), (margin,), (condim, margin))
+    ]
+    none, one, two, both = (x.velocity_after for x in steps)
+    found = lv.compare(steps[0], steps[3])
+    assert len(steps[3].blocks) > len(steps[0].blocks) and not found.pairing.list_unknown(1)
+    expected = 0.5 * ((one - none) + (both - two))
+    # MuJoCo turns free bodies without contact by implicit gyroscopic forces.
+    np.testing.assert_allclose(found.parts["friction"].mean, expected, rtol=0, atol=1e-5)
+    assert np.abs(expected).max() > 0.1
+
+
+def test_two_steps_of_one_engine_have_different_names():
+    a, b = read(), read("gripper", planted.CHANGES["gripper"]["solref"][0])
+    assert "first MuJoCo" in str(lv.compare(a, b)) and "second MuJoCo" in str(lv.compare(a, b))
