@@ -5,6 +5,7 @@ import pytest
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
+from lavender.sim.engine.problem import build_problem
 
 DT = 1 / 60  # s, 4 substeps
 BUDGET = {"solver_iterations": 4}
@@ -153,3 +154,35 @@ def test_other_solvers_keep_rows_too(solver):
     simulation = lv.Simulation(scene)
     assert (displacement(simulation, 30) < 1.5e-3).all()  # the slop, and half of it
     assert not simulation.state.head[HEAD["rebuilt"]]
+
+
+def test_gap_of_a_kept_contact_is_that_of_its_bodies():
+    # 0.8 mm in a step, below half the margin: the observation has the gap at the beginning of the last substep.
+    scene = lv.Scene(dt=DT, substeps=4, gravity=0.0, **BUDGET)
+    scene.add_plane()
+    scene.add_sphere(0.5, position=(0, 0, 0.505), velocity=(0.01, 0, -0.05))
+    simulation = lv.Simulation(scene)
+    observation = simulation.step()[0]
+    assert not simulation.state.head[HEAD["rebuilt"]]
+    gap = observation["positions"][1, 2] + 0.05 * DT / 4 - 0.5
+    assert observation["contacts"]["depth"] == pytest.approx([-gap], abs=1e-12)
+
+
+def test_rows_of_kept_contacts_stay_theirs_when_others_come_and_go():
+    # A heap of boxes, every other one without friction, so that contacts have one row or three; the diagonal of A is
+    # computed again from the arms and normals of the last substep.
+    scene = lv.Scene(dt=DT, substeps=4, **BUDGET)
+    scene.add_plane()
+    for i in range(18):
+        at = np.array([i % 3, i // 3 % 3, i // 9]) * 1.04 + (0.03 * (i % 5), 0.02 * (i % 7), 0.7)
+        scene.add_box(position=tuple(at), friction=0.0 if i % 2 else 0.5)
+    simulation = lv.Simulation(scene)
+    rebuilt = set()
+    for _ in range(50):
+        simulation.step()
+        problem = build_problem(
+            simulation.state, [b.name for b in scene.bodies], [], "the last substep"
+        )
+        np.testing.assert_allclose(simulation.state.a["d"][: problem.m], problem.d, rtol=1e-9)
+        rebuilt.add(int(simulation.state.head[HEAD["rebuilt"]]))
+    assert 1 in rebuilt  # Contacts were renewed in the middle of steps.
