@@ -42,8 +42,8 @@ MAX_FREE_STEP_SIZE = 500
 # Components of a program that misses tol are solved alone unless there are more of them.
 MAX_SINGLE_COMPONENTS = 50
 OPTION_HELP = {
-    "isolate": "run the backend in another process, which is killed at the time limit: True always, False never, None "
-    "(default) under a limit if the backend has none of its own",
+    "isolate": "run the backend in another process, which the call leaves at the time limit: True always, False never, "
+    "None (default) under a limit if the backend has none of its own",
     "form": "'program' (P, q and rows of from_qp), 'impulse', 'velocity' (bodies, J and M) or 'auto' (default)",
     "settings": "mapping of options of the backend, which override the options that are set from tol",
 }
