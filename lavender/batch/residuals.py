@@ -29,7 +29,10 @@ from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch
 from lavender.judge.residuals import (
     DEFAULT_THRESHOLD,
+    EXACT_TOL,
+    MAX_EXCUSED_RESIDUAL,
     MAX_REST_VELOCITY,
+    MAX_STIFF_RATIO,
     TOL,
     VERDICTS,
     Residual,
@@ -38,7 +41,16 @@ from lavender.judge.residuals import (
 )
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, list_problem_data
+from lavender.solvers.small import AUTO
+from lavender_ext.batch.many import (
+    CODE,
+    NUMBER,
+    PLACE,
+    Worker,
+    Worlds,
+    judge_motions,
+    list_problem_data,
+)
 from lavender_ext.core.checks import make_instance
 
 # Row of `Worlds.numbers` of each field of a residual.
@@ -52,6 +64,8 @@ NUMBER_OF_FIELD = {
     "velocity_at_zero": NUMBER["reference_speed"],
 }
 NO_VELOCITY = np.zeros(0)
+# The exact impulses of this number of worlds take less time than one motion that is judged by a single call.
+WORLDS_PER_SINGLE = 16
 NO_MORE_WORLDS = -1  # The methods of `Worker` return this after the last world.
 
 
@@ -242,6 +256,8 @@ class Residuals(WorldResults):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
         # `Residual.nothing_to_do` of the worlds that single calls processed.
         self._nothing_to_do: dict[int, bool] = {}
+        # Worlds that were judged by the acceleration that moved their bodies.
+        self.moved: set[int] = set()
         # Residuals of the worlds with forces of an engine that have lost digits.
         self.without_digits: dict[int, Residual] = {}
 
@@ -289,7 +305,11 @@ class Residuals(WorldResults):
         if i in self._nothing_to_do or not self._sizes[i]:
             return self._judge_world(i)
         return self._make_residual(
-            i, self._judge_world, precision=self.precision[i], threshold=self.threshold
+            i,
+            self._judge_world,
+            precision=self.precision[i],
+            threshold=self.threshold,
+            moved_by="acceleration" if i in self.moved else "impulse",
         )
 
     def __repr__(self) -> str:
@@ -380,6 +400,7 @@ def residual_many(
         errors,
     )
     above_floor = residuals._get_column("above_floor")
+    left = []
     for i, precision in enumerate(
         precisions
     ):  # For a list of problems, the compiled loop assumes float64.
@@ -390,8 +411,50 @@ def residual_many(
             else worlds[i].engine_motion is not None
         )
         if (is_float32 or (is_engine and above_floor[i] != 0.0)) and i not in residuals.faults:
-            judge_single(i)
+            left.append(i)
+    if type(worlds) is Batch and left and "float32" not in precisions:
+        left = _judge_motions(worlds, residuals, left)
+    for i in left:
+        judge_single(i)
     return residuals
+
+
+def _judge_motions(batch: Batch, residuals: Residuals, moved: list[int]) -> list[int]:
+    """Judge the accelerations that moved the bodies of some worlds; return the worlds that single calls must judge.
+
+    The exact impulses are the solutions from the engine's impulses, as in `EngineMotion.judge`.
+    """
+    size = prod(batch.velocity_shape)
+    change = np.zeros(size)
+    compliance = np.zeros(len(residuals._impulse))
+    left = []
+    own = []
+    for i in moved:
+        motion = batch.engine_motions[i]
+        rows = residuals._get_rows(i)
+        is_moved = motion.moved_by == "acceleration"
+        if not is_moved or not np.array_equal(motion.impulse, residuals._impulse[rows]):
+            left.append(i)
+            continue
+        own.append(i)
+        first = int(batch.at[i]["velocity"])
+        change[first : first + len(motion.change)] = motion.change
+        compliance[rows] = motion.compliance
+    if WORLDS_PER_SINGLE * len(own) < len(batch):
+        return sorted(left + own)
+    exact = batch.make_kernel_worlds(residuals._impulse.copy(), np.zeros(size), False)
+    hand = Worker(exact, bytearray(1))
+    while hand.process_worlds(EXACT_TOL, AUTO.call) != NO_MORE_WORLDS:
+        pass  # A single call judges a world that the loop leaves.
+    solved = [i for i in own if exact.code[i] == CODE["ready"]]
+    left += [i for i in own if exact.code[i] != CODE["ready"]]
+    engine = residuals._impulse, change, compliance
+    numbers, worst = residuals._worlds.numbers, residuals._worlds.worst
+    refused = judge_motions(
+        exact, EXACT_TOL, MAX_STIFF_RATIO, MAX_EXCUSED_RESIDUAL, engine, solved, numbers, worst
+    )
+    residuals.moved = set(solved) - set(refused)
+    return sorted(left + refused)
 
 
 def check_problems(problems: Any, errors: str) -> Any:

@@ -28,13 +28,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.judge.residuals import Residual, replace_error
+from lavender.judge.residuals import EXACT_TOL, MAX_STIFF_RATIO, Residual, replace_error
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
 MOVERS = ("acceleration", "forces")
-# [-] If R / d of all rows is larger, forces keep 11 of 16 digits.
-MAX_STIFF_RATIO = 1e-5
 MAX_MOTION_ENTRIES = (
     1_000_000  # Entries of J above which the dense QR factorisation of (2) takes seconds.
 )
@@ -42,9 +40,7 @@ MAX_BOUNDARY_ROUNDOFFS = (
     32.0  # [unit round-offs] Friction within this part of its bound is on the boundary.
 )
 ROUNDOFF_OF_PRECISION = {"float64": 2.0**-53, "float32": 2.0**-24}
-# [-] Relative residual of the solution in (1), which is below the rounding of most problems.
-EXACT_TOL = 1e-12
-SOLVERS = ("newton", "auto")  # The second one solves if the first one does not converge.
+SOLVERS = ("auto", "newton")  # The second one solves if the first one does not converge.
 # [-] Largest error of the solution in (1), relative to the error of the engine's forces.
 MAX_SOLUTION_ERROR = 0.1
 

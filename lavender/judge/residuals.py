@@ -79,6 +79,12 @@ UNIT_ROUNDOFF_FLOAT32 = 2.0**-24  # u of float32: half the distance from 1 to th
 at_floor = measure.is_residual_at_floor
 
 TOL = 1e-6  # [-] Default tolerance of `residual` and `solve`.
+# [-] Relative residual of exact impulses, by which motions of engines are judged (`lavender.io.engine_motion`); below
+# the rounding of most problems.
+EXACT_TOL = 1e-12
+MAX_STIFF_RATIO = (
+    1e-5  # [-] If R / d of all rows is larger, an engine's forces keep 11 of 16 digits.
+)
 # [m/s] Default of `threshold`: sensors of robots do not measure smaller velocity errors.
 DEFAULT_THRESHOLD = 1e-6
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (

@@ -28,6 +28,7 @@ from lavender_ext.small.call cimport derive_small_problem, judge_task, solve_sma
 from lavender_ext.small.task cimport (N_CALL_WORKSPACES, N_COUNTS, RESULT_FAILED, RESULT_IS_START, WORK, count_task_scratch,
                                       small_rules_t, task_t)
 from lavender_ext.batch.adjoint cimport adjoin_task, adjoint_t, cotangents_t
+from lavender_ext.batch.motion cimport judge_motion, motion_error_t, motion_t
 from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve_task
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
 from lavender_ext.host cimport grow_workspace_to, free_workspace
@@ -715,6 +716,23 @@ cdef class Worlds:
         self.number[RHS_ENERGY * (self.w.n + 1) + i] = compute_rhs_energy_norm(&j.v.p)
         return READY
 
+    cdef bint judge_motion_of_world(self, int64_t i, worker_t* h, double tol, double max_stiff_ratio, double max_excused,
+                                    const double** engine, motion_error_t* out) noexcept nogil:
+        """Judge the motion of world i (`motion.pxd`), whose start is exact; engine (3): arrays of `motion_t` of all worlds."""
+        cdef task_t j
+        cdef motion_t x
+        cdef const int64_t* at = self.w.at + i * PLACES
+        if self.tasks != NULL or self.convert_world(i, h, &j) != READY or j.v.p.n_rows == 0:
+            return False
+        j.tol = tol
+        if self.judge_start(i, h, &j, False) != READY:
+            h.made = j.made
+            return False
+        h.made = j.made                                 # The next world reuses the memory of `made`.
+        x.impulse, x.compliance = engine[0] + at[AT_ROW], engine[2] + at[AT_ROW]
+        x.change = engine[1] + at[VELOCITY]
+        return j.relative <= tol and judge_motion(&j, h.scratch.free, &x, max_stiff_ratio, max_excused, h.at, out)
+
     cdef bint adjoin_world(self, int64_t i, worker_t* h, int32_t max_rows, double max_residual,
                            const double** y, double** out) noexcept nogil:
         """Compute the results of `adjoin_task` of world i; y (3) are cotangents of all worlds or NULL, out (6) the results."""
@@ -785,6 +803,48 @@ def adjoin_worlds(Worlds worlds, int32_t max_rows, double max_residual, cotangen
             left.append(i)
         if i % INTERRUPT_CHECK_WORLDS == 0:
             PyErr_CheckSignals()
+    return left
+
+
+def judge_motions(Worlds worlds, double tol, double max_stiff_ratio, double max_excused, engine, list indices, numbers,
+                  int32_t[::1] worst):
+    """Judge the motions of an engine in some worlds, and write their numbers in place of those of the forces.
+
+    Parameters
+    ----------
+    worlds : Worlds
+        Their starts are exact, to the relative residual `tol`.
+    engine : sequence of 3
+        Flat arrays of all worlds: the engine's impulses, velocity changes and compliances (`motion.pxd`).
+    indices : list of int
+        Worlds to be judged.
+    numbers, worst
+        Arrays of the `Worlds` that receive the results.
+
+    Returns
+    -------
+    list of int
+        Worlds that the caller must judge by themselves.
+    """
+    cdef Worker worker = Worker(worlds, b"\0")
+    cdef const double* x[3]
+    cdef double[:, ::1] out = numbers
+    cdef motion_error_t found
+    cdef list left = []
+    cdef int64_t i
+    cdef bint is_done
+    x[0] = as_double_pointer(engine[0], worlds.impulse.size)
+    x[1] = as_double_pointer(engine[1], worlds.velocity.size)
+    x[2] = as_double_pointer(engine[2], worlds.impulse.size)
+    for i in indices:
+        with nogil:
+            is_done = worlds.judge_motion_of_world(i, &worker.h, tol, max_stiff_ratio, max_excused, x, &found)
+        if not is_done:
+            left.append(i)
+            continue
+        out[RELATIVE, i], out[FLOOR, i], out[ABOVE_FLOOR, i] = found.relative, found.floor, found.above_floor
+        out[ENERGY, i], out[SPEED, i], out[PUSH, i] = found.energy, found.velocity, found.push
+        worst[i] = found.worst
     return left
 
 

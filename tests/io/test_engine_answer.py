@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from mujoco_scene import get_state, mj
+from mujoco_scene import get_state, mj, state
 
 import lavender as lv
 from lavender.io import mujoco as adapter
@@ -267,3 +267,43 @@ def test_rotation_rows_of_a_weld_are_the_angular_velocity_for_every_torque_scale
     assert [problem.row_unit(k) for k in range(6)] == 3 * [problem.row_unit(0)] + 3 * [
         problem.row_unit(3)
     ]
+
+
+@pytest.mark.parametrize("iterations", [1, 100])
+@pytest.mark.parametrize(("integrator", "off"), [("RK4", False), ("Euler", True)])
+def test_motions_of_many_worlds_have_the_numbers_of_single_calls(integrator, off, iterations):
+    """The compiled loop judges accelerations, also if the solver stops early; other impulses are judged themselves."""
+    model, data = state("elliptic", condim=3)
+    kinds = mj.mjtIntegrator
+    model.opt.integrator = kinds.mjINT_RK4 if integrator == "RK4" else kinds.mjINT_EULER
+    model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_EULERDAMP) if off else 0
+    model.opt.iterations = iterations
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    states = np.empty((24, mj.mj_stateSize(model, kind)))
+    for i, of_world in enumerate(states):
+        world = mj.MjData(model)
+        mj.mj_copyData(world, model, data)
+        world.qvel[:] += 0.5 * np.random.default_rng(i).standard_normal(model.nv)
+        mj.mj_getState(model, world, of_world, kind)
+    batch, impulse = lv.io.from_mujoco_many(model, states)
+    changed = np.asarray(impulse).copy()
+    changed[batch.rows_of(3)] *= 0.9  # not what moved the bodies
+    many = lv.residual_many(batch, changed)
+    moved = 0
+    for i in range(len(batch)):
+        one = lv.residual(batch[i], changed[batch.rows_of(i)])
+        found = many[i]
+        for name in (
+            "relative",
+            "energy",
+            "velocity",
+            "roundoff_floor",
+            "above_floor",
+            "worst_row",
+            "moved_by",
+        ):
+            assert getattr(found, name) == getattr(one, name), (i, name)
+        assert many.verdict[i] == one.verdict
+        moved += one.moved_by == "acceleration"
+    assert many[3].moved_by == "impulse"
+    assert iterations > 1 or moved >= 20
