@@ -216,3 +216,33 @@ def drake_reactions_contain_limits():
     _simulator, context = simulate_drake(builder, plant, 1.0)
     (reaction,) = plant.get_reaction_forces_output_port().Eval(context)
     return np.isclose(abs(reaction.rotational()[1]), 0.3 * 9.81, rtol=1e-3)
+
+
+@fact(
+    *DRAKE,
+    "damping of joints",
+    "A step is implicit in the damping of a joint with kSap, kSimilar and kLagged, and explicit with kTamsi: beyond "
+    "h d = 2 I the joint is unstable.",
+    "v\\* of `from_drake` is the plant's own.",
+)
+def drake_damps_joints_explicitly_with_tamsi():
+    from pydrake.all import DiscreteContactApproximation, MultibodyPlant, Parser, Simulator
+
+    urdf = (
+        '<robot name="r"><link name="base"/><link name="a"><inertial><mass value="1"/>'
+        '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>'
+        '<dynamics damping="50"/></joint></robot>'
+    )
+    speeds = []
+    for name in ("kSap", "kSimilar", "kLagged", "kTamsi"):
+        plant = MultibodyPlant(0.01)
+        plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, name))
+        Parser(plant).AddModelsFromString(urdf, "urdf")
+        plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
+        plant.Finalize()
+        simulator = Simulator(plant)
+        plant.SetVelocities(simulator.get_mutable_context(), [1.0])
+        simulator.AdvanceTo(0.01)
+        speeds.append(plant.GetVelocities(simulator.get_context())[0])
+    return np.allclose(speeds, [1 / 6] * 3 + [-4.0], atol=1e-3)

@@ -7,7 +7,13 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-PROBE_MODULES = "engine_probes", "engine_drake_probes", "engine_newton_probes", "engine_file_probes"
+PROBE_MODULES = (
+    "engine_probes",
+    "engine_drake_probes",
+    "engine_newton_probes",
+    "engine_file_probes",
+    "engine_mjcf_probes",
+)
 
 
 @dataclass(frozen=True)
