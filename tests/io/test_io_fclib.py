@@ -177,6 +177,13 @@ def test_load_of_global_fclib_with_an_asymmetric_m_forms_a(tmp_path):
     )
     assert problem.operator == "matrix"
     np.testing.assert_allclose(problem.dense(), h.T @ np.linalg.inv(m) @ h, rtol=1e-14, atol=1e-15)
+    # A change of the rest of M that makes it symmetric changes the way, not the formula.
+    for asymmetry in (0.0, 1.0):
+        m[0, 1] = asymmetry
+        parts = {"M": encoded(m, -2), "H": encoded(h, -2)}
+        path = make(tmp_path / f"{asymmetry}.h5", f=np.arange(3.0), w=np.ones(3), mu=[0.5], **parts)
+        expected = -(1.0 + h.T @ np.linalg.inv(m) @ np.arange(3.0))
+        np.testing.assert_allclose(lavender.io.load(path).b, expected, rtol=1e-14, atol=1e-15)
 
 
 def test_load_of_fclib_equations_become_free_rows(tmp_path):
