@@ -78,8 +78,10 @@ cdef inline int32_t find_fault_of_row_bounds(const double* lower, const double* 
 
 
 cdef inline int32_t find_friction_fault(const blocks_t* p, int32_t kind, int32_t i) noexcept nogil:
-    """Return the fault of the coefficients of block i; NULL: zeros."""
-    cdef double mu = p.mu[i] if p.mu != NULL else 0.0, radius = p.patch_radius[i] if p.patch_radius != NULL else 0.0
+    """Return the fault of the coefficients of block i; NULL: zeros, and ratios of 1."""
+    cdef double mu = p.mu[i] if p.mu != NULL else 0.0, radius = 1.0 if kind == CONTACT_BOX else 0.0
+    if p.patch_radius != NULL:
+        radius = p.patch_radius[i]
     if not is_valid_magnitude(mu):
         return FAULT_MU
     if not is_valid_magnitude(radius):
@@ -105,7 +107,7 @@ cdef inline int32_t find_block_fault(const blocks_t* p, int64_t* index) noexcept
         index[0] = i
         if not allows_rows(CONTACT_BOX if kind == CONTACT_ELLIPSE else kind, end - first):
             return FAULT_KIND
-        if kind == CONTACT_ELLIPSE and not 1.0 / max_ratio <= p.patch_radius[i] <= max_ratio:
+        if kind == CONTACT_ELLIPSE and p.patch_radius != NULL and not 1.0 / max_ratio <= p.patch_radius[i] <= max_ratio:
             return FAULT_RATIO
         fault = find_friction_fault(p, kind, i)
         if fault != NO_FAULT:

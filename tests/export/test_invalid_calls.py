@@ -414,3 +414,22 @@ def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, fold
         if "(" in line and "[" not in line
     }
     assert all(hasattr(library.c, name) for name in names)
+
+
+def test_box_without_a_ratio_has_the_friction_of_a_square(library):
+    """patch_radius null: the ratio of a box is 1, as in Python, and its second tangent has friction."""
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(6, 8))
+    cones = lv.Cones.contacts(np.full((2, 2), 0.5), shape="box")
+    square = lv.Problem(np.array([2.0, 1.0, 3.0, 3.0, -2.0, 1.0]), cones, half @ half.T)
+    assert square.cones.has_box
+    method = "pgs"
+    options = library.options(method)
+    found = []
+    for more in ({}, {"patch_radius": None}):
+        solver = library.open(library.problem(square, **more), options)
+        solver.run(50, 0.0)
+        found.append(solver.impulse())
+    np.testing.assert_array_equal(*found)
+    second = square.cones.ptr[:-1][square.cones.is_box] + 2
+    assert np.abs(found[1][second]).max() > 0.0

@@ -117,7 +117,7 @@ typedef struct lav_problem {
   const int32_t *kind;         /* (k); null: ROW */
   const double *lower, *upper; /* (m) N s, read on ROW blocks; null: no bound */
   const double *mu;            /* (k) >= 0; null: 0 */
-  const double *patch_radius;  /* (k) m, of CONTACT_BOX mu_2 / mu_1, >= 0; null: 0 */
+  const double *patch_radius;  /* (k) m, of CONTACT_BOX mu_2 / mu_1, >= 0; null: 0, of CONTACT_BOX 1 */
   const double *b;             /* (m) m/s; null: target - J velocity */
   const double *target;        /* (m) m/s; null: 0 */
   const double *velocity;      /* v*: (n_bodies, 6) linear, then angular; (nv); null: 0 */

@@ -153,7 +153,8 @@ static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, co
   lav_dump_reals(&d, "cones_lower", q->lower, m, "", 1, -INFINITY);
   lav_dump_reals(&d, "cones_upper", q->upper, m, "", 1, INFINITY);
   lav_dump_reals(&d, "cones_mu", q->mu, k, "", 1, 0.0);
-  lav_dump_reals(&d, "cones_patch_radius", q->patch_radius, k, "", 1, 0.0);
+  for (i = 0; i < k; i++) b[m + i] = q->patch_radius ? q->patch_radius[i] : kind[i] == LAV_CONTACT_BOX ? 1.0 : 0.0;
+  lav_dump_reals(&d, "cones_patch_radius", b + m, k, "", 1, 0.0);
   if (q->rolling) lav_dump_reals(&d, "cones_rolling", q->rolling, k, "", 1, 0.0);
   if (q->impulse) lav_dump_reals(&d, "guess", q->impulse, m, "", 1, 0.0);
   snprintf(size, sizeof size, "%d,", (int)k);

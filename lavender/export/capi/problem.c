@@ -142,6 +142,8 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   core_block_types_write_contact_bounds(&s->p);
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
+  for (i = 0; i < k && !q->patch_radius; i++) /* A box without a ratio is a square. */
+    if (kind[i] == LAV_CONTACT_BOX) ((double *)(uintptr_t)s->p.patch_radius)[i] = 1.0;
   copy_or(s->p.rolling, q->rolling, k, 0.0);
   s->has_keys = q->key != NULL;
   if (q->key) COPY(s->key, q->key, k);
