@@ -1,4 +1,14 @@
-/* Functions of lanes.h for one width. lanes.h defines the following names, and this file removes them at its end.
+/* Functions of lanes.h for one width: each vector holds the same number of WIDTH worlds, which no operation mixes.
+ *
+ *     lane          0     1     2     3        x->lam[WIDTH * row + lane], and so every array of rows or velocities
+ *     row 0        [w0]  [w1]  [w2]  [w0]      a group of three worlds in four lanes: the last lane repeats the first world
+ *     row 1        [w0]  [w1]  [ 0]  [w0]      world 2 has no such row: bounds 0, J = 0, a tiny compliance (`load_lanes`)
+ *     A[k][row]    x->a[WIDTH * (LAVENDER_PLACES(V, m) * k + row) + lane], column by column
+ *     own, left    lists of runs [first, end) of the columns that any lane has (`lavender_list_columns`)
+ *
+ * Lanes that are finished stay in the loop with a mask `on`. A world has the same bits in every lane and width.
+ *
+ * lanes.h defines the following names, and this file removes them at its end.
  *
  *     LANE(f)     name of function f of this width, such as f_4
  *     WIDTH       number of lanes
