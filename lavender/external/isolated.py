@@ -258,8 +258,6 @@ def start_process(backend: Backend) -> None:
     If processes go on beyond the limit of a call, another one is started in the background.
     """
     with _LOCK:
-        if any(backend.name in process.warm for process in idle_processes):
-            return
         is_busy = [process.is_busy for process in idle_processes]
         has_others = len(is_busy) > 0 or is_starting_spare()
     if has_others and all(is_busy):
