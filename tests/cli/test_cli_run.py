@@ -76,14 +76,14 @@ def test_run_film_writes_one_frame_for_each_40_ms_of_simulated_time(lavender, tm
 
 
 def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path):
-    step = Simulation.step
+    run = Simulation.run
 
-    def stopped(self):
+    def stopped(self, n):
         if self.time > 0.04:
             raise KeyboardInterrupt
-        return step(self)
+        return run(self, n)
 
-    monkeypatch.setattr(Simulation, "step", stopped)
+    monkeypatch.setattr(Simulation, "run", stopped)
     trace, film, problems = (tmp_path / name for name in ("t.csv", "f.gif", "steps"))
     files = ("--trace", trace, "--film", film, "--record", problems)
     code, out, _ = lavender("run", "stack", "--steps", "50", *files)
@@ -94,7 +94,7 @@ def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path):
     )  # of the state after a step
     assert rows["step"].tolist() == [1, 2, 3, 4, 5] and film.stat().st_size
     assert len(list(problems.iterdir())) >= 5
-    monkeypatch.setattr(Simulation, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(Simulation, "run", lambda self, n: (_ for _ in ()).throw(KeyboardInterrupt))
     assert lavender("run", "stack")[0] == 130  # nothing to keep
 
 
