@@ -41,6 +41,8 @@ from lavender.io.step_record import StepRecord, get_force
 # [-] Largest difference of the velocities before the step, relative to the largest velocity and to 1 m/s: rounding of
 # float32 and of conversions of coordinates.
 MAX_START_DIFFERENCE = 1e-4
+# [-] Largest difference of a position before the step, relative to itself and to 1 m or rad: some roundings of float32.
+MAX_POSITION_DIFFERENCE = 1e-6
 MAX_TIME_STEP_DIFFERENCE = 1e-6  # [-]
 # [-] An acceleration with at most this part of the forces' error is exact: the forces have lost their digits.
 MAX_ACCELERATION_ERROR = 0.1
@@ -153,13 +155,29 @@ def _check_steps(a: StepRecord, b: StepRecord) -> None:
             "must start from the same state, with free bodies rotated alike"
         )
     if a.position is not None and b.position is not None and len(a.position) == len(b.position):
-        gap = np.abs(a.position - b.position)
-        if gap.max(initial=0.0) > MAX_START_DIFFERENCE * max(1.0, float(np.abs(a.position).max())):
-            i = int(np.argmax(gap))
+        theirs = _turn_quaternions(a, b)
+        sizes = np.maximum(1.0, np.maximum(np.abs(a.position), np.abs(theirs)))
+        apart = np.abs(a.position - theirs) / sizes
+        if apart.max(initial=0.0) > MAX_POSITION_DIFFERENCE:
+            i = int(np.argmax(apart))
             raise InputError(
-                f"position {i} is {a.position[i]:.6g} in a and {b.position[i]:.6g} in b before the step: both must "
+                f"position {i} is {a.position[i]:.9g} in a and {theirs[i]:.9g} in b before the step: both must "
                 "start from the same state"
             )
+
+
+def _turn_quaternions(a: StepRecord, b: StepRecord) -> FloatArray:
+    """Return the positions of b, with -q instead of its quaternions q where that is nearer to a."""
+    assert a.position is not None and b.position is not None
+    turned = b.position.copy()
+    owner = a.position_owner if b.position_owner is None else b.position_owner
+    if owner is None:
+        return turned
+    for joint in np.unique(owner):
+        places = np.flatnonzero(owner == joint)[-4:]
+        if len(places) == 4 and a.position[places] @ turned[places] < 0.0:
+            turned[places] *= -1.0
+    return turned
 
 
 def _measure_left_over(

@@ -79,7 +79,8 @@ class Pairing:
 
     def make_unmatched(self, source: StepRecord, block: ConstraintBlock) -> ConstraintBlock | None:
         """Return a contact with the settings that `source` would give it; None if its geoms are not known there."""
-        settings = [source.geom_settings[x] for x in block.geoms if x in source.geom_settings]
+        known = source.geom_settings
+        settings = [known[x] for x in block.geom_keys or block.geoms if x in known]
         cone = {"pyramidal": "pyramid", "elliptic": "ellipse"}.get(source.settings.get("cone", ""))
         if block.role != "contact" or len(settings) != 2 or cone is None:
             return None
@@ -113,5 +114,7 @@ class Pairing:
 
 def measure_distance(a: ConstraintBlock, b: ConstraintBlock) -> float:
     """Return the distance of two blocks [m], with `OTHER_GEOMS_DISTANCE` for contacts of other geoms."""
-    are_other = bool(a.geoms and b.geoms) and set(a.geoms) != set(b.geoms)
+    has_keys = bool(a.geom_keys and b.geom_keys)  # Not in older files.
+    ours, theirs = (x.geom_keys if has_keys else x.geoms for x in (a, b))
+    are_other = bool(ours and theirs) and set(ours) != set(theirs)
     return float(np.linalg.norm(a.position - b.position)) + OTHER_GEOMS_DISTANCE * are_other

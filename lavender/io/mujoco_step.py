@@ -107,9 +107,19 @@ class StepReader:
         """Find the names of bodies, geoms and joints."""
         model = self.model
         self.dt, self.nv = float(model.opt.timestep), int(model.nv)
-        self.bodies = [_name(model.body(i), "body", i) for i in range(model.nbody)]
-        self.geoms = [model.geom(i).name or str(i) for i in range(model.ngeom)]
         self.joints = [_name(model.joint(i), "joint", i) for i in range(model.njnt)]
+        self.bodies = [_name(model.body(i), "body", i) for i in range(model.nbody)]
+        self.owners = list(self.bodies)
+        # Numbers of bodies and geoms change with any other one; joints and places within a body do not.
+        for b in range(model.nbody):
+            if model.body_jntnum[b] and not model.body(b).name:
+                self.bodies[b] = f"body of {self.joints[model.body_jntadr[b]]}"
+        self.geoms = [model.geom(i).name or str(i) for i in range(model.ngeom)]
+        self.geom_keys = [model.geom(i).name for i in range(model.ngeom)]
+        for i in range(model.ngeom):
+            b = model.geom_bodyid[i]
+            place = i - model.body_geomadr[b]
+            self.geom_keys[i] = self.geom_keys[i] or f"geom {place} of {self.bodies[b]}"
 
     def copy(self, data: Any) -> Any:
         """Return a copy of the data."""
@@ -171,12 +181,18 @@ class StepReader:
             stiffness_matrix=stiffness, uses_stiffness=self.is_discrete,
             uses_damping=uses_damping, uses_actuators=uses_actuators, in_problem=self.is_discrete,
             implicit_rows=self.is_discrete, blocks=tuple(g.block for g in groups), law="cone",
-            names=names, angular=angular, position=np.array(data.qpos),
+            names=names, angular=angular, position=np.array(data.qpos), position_owner=self.find_position_owner(),
             acceleration=np.array(data.qacc), moved_by=moved_by,
             before_noslip=self.read_forces_before_noslip(groups), weights=self.read_weights(),
             softnesses=self.read_softnesses(), geom_settings=self.read_geom_settings(), settings=self.read_settings(),
             precision=self.precision,
         )  # fmt: skip
+
+    def find_position_owner(self) -> IntArray:
+        """Return the first velocity of the joint of each position (nq,)."""
+        model = self.model
+        counts = np.diff(np.append(model.jnt_qposadr, model.nq))
+        return np.repeat(model.jnt_dofadr, counts).astype(np.int64)
 
     def read_mass(self) -> FloatArray:
         """Return M (nv, nv)."""
@@ -298,7 +314,7 @@ class StepReader:
             )
             owner = self.joints[j]
             if kind == 0 and not model.joint(j).name:
-                owner = self.bodies[int(model.jnt_bodyid[j])]
+                owner = self.owners[int(model.jnt_bodyid[j])]
             names.append(owner + suffix)
             angular[k] = kind in ROTATIONS or (kind == 0 and place >= 3)
         return tuple(names), angular
@@ -359,17 +375,26 @@ class StepReader:
         return result
 
     def read_geom_settings(self) -> dict[str, GeomSettings]:
-        """Return the contact settings of geoms, unless pairs of geoms have their own."""
+        """Return the contact settings of geoms or of the override; none if pairs of geoms have their own."""
         model = self.model
         if model.npair:
             return {}
+        friction = np.array(model.geom_friction)[:, [0, 0, 1, 2, 2]]
+        softnesses = [
+            self.make_softness(*x) for x in zip(model.geom_solref, model.geom_solimp, strict=True)
+        ]
+        if int(model.opt.enableflags) & int(self.mj.mjtEnableBit.mjENBL_OVERRIDE):
+            option = model.opt
+            own = self.make_softness(option.o_solref, option.o_solimp, option.o_solref)
+            softnesses = [own] * model.ngeom
+            friction[:] = option.o_friction
+        friction = np.maximum(friction, self.mj.mjMINMU)
         return {
             name: GeomSettings(
                 int(model.geom_condim[i]), int(model.geom_priority[i]), float(model.geom_solmix[i]),
-                np.array(model.geom_friction[i]),
-                self.make_softness(model.geom_solref[i], model.geom_solimp[i]),
+                friction[i], softnesses[i],
             )
-            for i, name in enumerate(self.geoms)
+            for i, name in enumerate(self.geom_keys)
         }  # fmt: skip
 
     def make_softness(self, solref: Any, solimp: Any, friction: Any = (0.0, 0.0)) -> Softness:
@@ -488,11 +513,15 @@ class StepReader:
         if min(numbers) >= 0:
             pair = [int(model.geom_bodyid[g]) for g in numbers]
             jac = self.compute_contact_jacobian(contact, pair)
-            geoms, bodies = (tuple(names[i] for i in ids) for names, ids in
-                             ((self.geoms, numbers), (self.bodies, pair)))  # fmt: skip
+            geoms, keys, bodies = (
+                tuple(names[i] for i in ids)
+                for names, ids in (
+                    (self.geoms, numbers), (self.geom_keys, numbers), (self.bodies, pair),
+                )
+            )  # fmt: skip
             weight = np.array([model.body_invweight0[pair, 0].sum()])
         else:  # A flex, whose vertices are bodies: the engine's own rows.
-            jac, geoms, bodies = self.jacobian[rows], (), ("flex", "flex")
+            jac, geoms, keys, bodies = self.jacobian[rows], (), (), ("flex", "flex")
             if is_pyramid:
                 plus, minus = jac[0::2], jac[1::2]
                 mu = friction[: condim - 1, None]
@@ -513,7 +542,7 @@ class StepReader:
             cone="" if condim == 1 else "pyramid" if is_pyramid else "ellipse", condim=condim,
             friction=friction, surface_velocity=surface,
             force=_gather_force(data.efc_force[rows], condim, is_pyramid, friction),
-            geoms=geoms, bodies=bodies, position=np.array(contact.pos),
+            geoms=geoms, geom_keys=keys, bodies=bodies, position=np.array(contact.pos),
         )  # fmt: skip
         return _Rows(block, rows)
 

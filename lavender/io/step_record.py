@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array
+from lavender.base.arrays import FloatArray, IntArray, as_array
 from lavender.base.errors import InputError
 from lavender.io.stored import as_path, write_arrays
 
@@ -85,15 +85,15 @@ class GeomSettings:
     condim: int
     priority: int
     mix: float
-    friction: FloatArray  # (3,): sliding, spin, rolling.
+    friction: FloatArray  # (5,): both tangents, spin, both rolling axes.
     softness: Softness
 
     def combine(self, other: GeomSettings) -> tuple[int, FloatArray, Softness]:
         """Return condim, coefficients (5,) and softness of a contact of two geoms, by MuJoCo's rule."""
         if self.priority != other.priority:
             chosen = self if self.priority > other.priority else other
-            return chosen.condim, chosen.friction[[0, 0, 1, 2, 2]], chosen.softness
-        friction = np.maximum(self.friction, other.friction)[[0, 0, 1, 2, 2]]
+            return chosen.condim, chosen.friction, chosen.softness
+        friction = np.maximum(self.friction, other.friction)
         total = self.mix + other.mix
         share = self.mix / total if total >= SMALLEST_MIX else 0.5
         if total >= SMALLEST_MIX and min(self.mix, other.mix) < SMALLEST_MIX:
@@ -140,7 +140,9 @@ class ConstraintBlock:
     force : (k,), N, N m
         The engine's own answer along the rows of `jacobian`.
     geoms : tuple of str
-        Geoms of a contact.
+        Geoms of a contact; numbers of those without a name.
+    geom_keys : tuple of str
+        The same for matching: geoms without a name have their place in their body. Default `geoms`.
     bodies : tuple of str
         Bodies of a contact, which name its weights in `StepRecord.weights`.
     position : (3,), m
@@ -165,6 +167,7 @@ class ConstraintBlock:
     bias: FloatArray | None = None
     force: FloatArray | None = None
     geoms: tuple[str, ...] = ()
+    geom_keys: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()
     position: FloatArray = field(default_factory=lambda: np.zeros(3))
     bounds: FloatArray | None = None
@@ -219,6 +222,8 @@ class StepRecord:
         Velocities in rad/s.
     position : (nq,), optional
         Positions before the step, if the engine's coordinates are the ones of the file.
+    position_owner : (nq,) int, optional
+        First velocity of the joint of each position. A joint with seven positions, or four, ends with a quaternion.
     acceleration : (nv,), m/s^2, rad/s^2, optional
         The engine's own acceleration in the constraint problem.
     moved_by : {"forces", "acceleration"}
@@ -262,6 +267,7 @@ class StepRecord:
     names: tuple[str, ...]
     angular: np.ndarray
     position: FloatArray | None = None
+    position_owner: IntArray | None = None
     acceleration: FloatArray | None = None
     moved_by: str = "forces"
     before_noslip: tuple[FloatArray, ...] | None = None
@@ -444,6 +450,11 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
         Index in this record of each velocity of the result.
     names : tuple of str
         Names of the velocities of the result.
+
+    Notes
+    -----
+    Positions follow the first velocity of their joint. A record that does not know it (`position_owner`), such as an
+    older file, loses its positions, so that `lavender.compare` checks velocities only.
     """
     if not isinstance(record, StepRecord):
         raise InputError(f"record is a {type(record).__name__}; a StepRecord is needed")
@@ -466,4 +477,10 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
     ):
         changed[name] = getattr(record, name)[np.ix_(order, order)]
     blocks = tuple(replace(b, jacobian=b.jacobian[:, order]) for b in record.blocks)
+    if record.position is not None and record.position_owner is not None:
+        owner = np.argsort(order)[record.position_owner]
+        places = np.argsort(owner, kind="stable")
+        changed |= {"position": record.position[places], "position_owner": owner[places]}
+    elif (order != np.arange(n)).any():
+        changed["position"] = None
     return replace(record, **changed, blocks=blocks, names=names)

@@ -233,4 +233,10 @@ def _rename_block(block: ConstraintBlock, names: Mapping[str, str]) -> Constrain
     if block.role != "contact":
         return replace(block, key=_rename_key(block.key, names))
     bodies = tuple(names.get(x, x) for x in block.bodies)
-    return replace(block, key=f"contact of {' and '.join(sorted(bodies))}", bodies=bodies, geoms=())
+    return replace(
+        block,
+        key=f"contact of {' and '.join(sorted(bodies))}",
+        bodies=bodies,
+        geoms=(),
+        geom_keys=(),
+    )
