@@ -57,7 +57,7 @@ def declared(table):
 
 def test_imports_of_the_package_are_declared():
     # Anything that lavender imports at all stands in pyproject.toml under its own name.
-    known = declared("dependencies") | declared("fclib") | declared("qp")
+    known = declared("dependencies") | declared("report") | declared("fclib") | declared("qp")
     known |= (
         declared("cluster")
         | declared("peers")
