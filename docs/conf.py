@@ -69,7 +69,7 @@ CONTENTS = {
     "Start": "install quickstart concepts error sweep",
     "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
-    "Judge engines": "audit mujoco worlds engines read-a-step report commands scorecard scorecard-settings",
+    "Judge engines": "audit compare mujoco worlds engines read-a-step report commands scorecard scorecard-settings",
     "LavenderSim and the course": "engine course/chapter course/answers generated/examples",
     "Background": "residual methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
     "Project": "plugin architecture generated/api",

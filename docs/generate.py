@@ -762,6 +762,7 @@ API_TITLES = {
     "external": "Quadratic programs",
     "programs": "Quadratic programs",
     "gradient": "Derivatives",
+    "causes": "Causes of differences between engines",
     "diagnostics": "Diagnostics",
     "solvers": "Registry of solvers",
     "audit": "Audit",
