@@ -188,7 +188,8 @@ class ConvexProgram:
     def find_rows_of_failing_size(self, x: FloatArray, tol: float) -> IntArray:
         """Return the rows with right-hand sides of up to the size of the rows that x (n,) violates.
 
-        A row is violated by more than tol |t_i|; rounding of its terms is subtracted unless they are large.
+        A row is violated by more than tol |t_i|; rounding of its terms is subtracted unless they are large. If
+        all of these have right-hand sides of 0, their residuals take the place of these.
         """
         slack = self.jacobian @ x - self.t
         side = np.abs(self.t)
@@ -198,8 +199,23 @@ class ConvexProgram:
         )
         rounding = np.where(terms > MAX_TERM_GROWTH * side, 0.0, ROW_ROUNDING * terms)
         scaled_side = side * self.scales[1]
-        limit = scaled_side.max(initial=0.0, where=size - rounding > tol * side)
+        is_violated = size - rounding > tol * side
+        limit = scaled_side.max(initial=0.0, where=is_violated)
+        if limit == 0.0:
+            limit = (size * self.scales[1]).max(initial=0.0, where=is_violated)
         return np.flatnonzero(scaled_side <= MAX_SIDE_RATIO * limit).astype(np.int32)
+
+    def has_hidden_column(self, x: FloatArray, lam: FloatArray, tol: float) -> bool:
+        """Return whether a residual above tol |q_j| of a column counts as rounding of larger terms.
+
+        There the strict error cannot tell a solution from a point far along a ray.
+        """
+        force, cost = self.jacobian.T, np.abs(self.q)
+        residual = np.abs(self.hessian @ x + self.q - force @ lam)
+        terms = abs(self.hessian) @ np.abs(x) + cost + abs(force) @ np.abs(lam)
+        limit = tol * cost
+        is_hidden = (residual > limit) & (ROW_ROUNDING * terms > limit) & (cost > 0.0)
+        return bool(is_hidden.any())
 
     def get_reached_side(self, x: FloatArray) -> FloatArray:
         """Return the largest right-hand side of each row's component that x (n,) reaches (m,), in scaled units."""

@@ -19,6 +19,9 @@ from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.problem import Problem
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
+# [-] The same for a ray that is searched beside a point that meets tol: rounding of a residual alone
+# (16 unit roundoffs).
+EXACT_RAY_TOLERANCE = 2.0**-49
 FEASIBLE_TOLERANCE = (
     1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
 )
@@ -129,48 +132,102 @@ def _search_rows(
 
 @np.errstate(all="ignore")
 def find_ray(
-    program: ConvexProgram, x: FloatArray | None, deadline: Deadline
+    program: ConvexProgram,
+    x: FloatArray | None,
+    deadline: Deadline,
+    tolerances: tuple[tuple[float, float], ...] = ((RAY_TOLERANCE, RAY_TOLERANCE),),
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,) of an unbounded program, or None."""
+    """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,) of an unbounded program, or None.
+
+    A ray of one component is a ray of the program. All components are searched by one linear program,
+    in which each has its own units of the cost, and each direction is checked alone.
+
+    Parameters
+    ----------
+    tolerances : tuple of (level, slope)
+        Largest P d and J d, and smallest -q.d, as multiples of their terms; one pair must hold.
+    """
     scaled, (scale, _, sigma, _) = program.scaled, program.scales
     n, free = scaled.n, program.free
     hessian, jac = scaled.hessian, scaled.jacobian
+    part, count = program.components
+    column_part, row_part = part[:n], part[n:]
+    q = scaled.q / _get_sizes(scaled.q, column_part, count)[column_part]
+    largest = _get_sizes(abs(hessian).max(axis=1).toarray().ravel(), column_part, count)
+    hessian = sp.csr_matrix(sp.diags_array(1.0 / largest[column_part]) @ hessian)
     level = sp.vstack([hessian, jac[:free]])
-    d = _solve_linear_program(scaled.q, level, jac[free:], -1.0, 1.0, deadline)
-    if d is None or not scaled.q @ d < 0.0 or deadline.has_passed():
+    found = _solve_linear_program(q, level, jac[free:], -1.0, 1.0, deadline)
+    if found is None:
         return None
-    d = _remove_small_entries(d)
-    at_bound = np.abs(jac @ d) <= RAY_TOLERANCE * (abs(jac) @ np.abs(d))
-    at_bound[:free] = True
-    rays = [_project_to_kernel(d, sp.vstack([hessian, jac[at_bound]])), d]
-    for ray in rays:
-        # The objective must decrease without end along the ray, up to RAY_TOLERANCE of the terms of each row.
-        size = np.abs(ray)
-        slope = jac @ ray
-        limits = RAY_TOLERANCE * (abs(jac) @ size)
-        is_level = (np.abs(hessian @ ray) <= RAY_TOLERANCE * (abs(hessian) @ size)).all()
-        is_allowed = (np.abs(slope[:free]) <= limits[:free]).all() and (
-            slope[free:] >= -limits[free:]
-        ).all()
-        if is_level and is_allowed and scaled.q @ ray < -RAY_TOLERANCE * (np.abs(scaled.q) @ size):
+    slopes = np.bincount(column_part, q * found, minlength=count)
+    for c in np.argsort(slopes, kind="stable"):
+        if not slopes[c] < 0.0 or deadline.has_passed():
+            return None
+        columns = np.flatnonzero(column_part == c)
+        rows = np.flatnonzero(row_part == c)
+        direction = _find_component_ray(
+            found[columns],
+            q[columns],
+            hessian[columns][:, columns],
+            jac[rows][:, columns],
+            int(np.count_nonzero(rows < free)),
+            tolerances,
+        )
+        if direction is not None:
             break
     else:
         return None
+    ray = np.zeros(n)
+    ray[columns] = direction
     if x is None or not _is_feasible(program, x):
         if deadline.has_passed():
             return None
         none = np.full(n, np.inf)
-        t = (scaled.t[:free], scaled.t[free:])
+        sizes = np.minimum(_get_sizes(scaled.t, row_part, count), 1.0)
+        t = scaled.t / sizes[row_part]
         found = _solve_linear_program(
-            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, *t
+            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, t[:free], t[free:]
         )
         if found is None:
             return None
-        x = found * (scale * sigma)
+        x = found * sizes[column_part] * (scale * sigma)
         if not _is_feasible(program, x):
             return None
     ray = ray * scale
     return ray / np.abs(ray).max(), x
+
+
+def _find_component_ray(
+    d: FloatArray,
+    q: FloatArray,
+    hessian: Any,
+    jac: Any,
+    free: int,
+    tolerances: tuple[tuple[float, float], ...],
+) -> FloatArray | None:
+    """Return d or its projection if the objective of a component decreases without end along it, or None."""
+    d = _remove_small_entries(d)
+    at_bound = np.abs(jac @ d) <= RAY_TOLERANCE * (abs(jac) @ np.abs(d))
+    at_bound[:free] = True
+    for ray in (_project_to_kernel(d, sp.vstack([hessian, jac[at_bound]])), d):
+        size = np.abs(ray)
+        slope = jac @ ray
+        # The largest error of a level row, and of an inequality that the ray leaves.
+        error = np.append(np.abs(hessian @ ray), -slope)
+        error[len(ray) : len(ray) + free] = np.abs(slope[:free])
+        terms = np.append(abs(hessian) @ size, abs(jac) @ size)
+        for tolerance, min_slope in tolerances:
+            if (error <= tolerance * terms).all() and q @ ray < -min_slope * (np.abs(q) @ size):
+                return ray
+    return None
+
+
+def _get_sizes(values: FloatArray, part: Any, count: int) -> FloatArray:
+    """Return the power of two near the largest |value| of each component (count,); 1 if that is 0."""
+    sizes = np.zeros(count)
+    np.maximum.at(sizes, part, np.abs(values))
+    sizes[sizes == 0.0] = 1.0
+    return np.asarray(np.exp2(np.round(np.log2(sizes))))
 
 
 def _is_feasible(program: ConvexProgram, x: FloatArray) -> bool:

@@ -63,7 +63,7 @@ class ProgramJudge:
         The best point, with complementary multipliers; None without a point.
     error, strict_error, hidden_error : float
         Its errors by `judge_program`; the strict one compares rows and columns with their right-hand
-        side and q alone, the hidden one is that of rows with a right-hand side that is rounding.
+        side and q alone, the hidden one is that of rows with a right-hand side that is rounding or 0.
     """
 
     def __init__(self, program: ConvexProgram, tol: float, deadline: Deadline) -> None:

@@ -23,7 +23,12 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.forms import get_program
-from lavender.external.proofs import find_infeasibility_proof, find_ray
+from lavender.external.proofs import (
+    EXACT_RAY_TOLERANCE,
+    RAY_TOLERANCE,
+    find_infeasibility_proof,
+    find_ray,
+)
 from lavender.external.qp_solver import OPTION_HELP, ProgramJudge, QPSolver, get_false_claim_error
 from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.judge.residuals import residual
@@ -256,12 +261,26 @@ class _Task:
                 only_small=is_strict,
             )
             if self.proof is None and self.qp.is_singular and not is_strict:
-                found = find_ray(self.program, self.judge.x, self.deadline)
-                if found is not None:
-                    self.ray = mark_read_only(found[0])
-                    self.judge.x = found[1]
-                    self.judge.lam = np.zeros(len(self.qp.target))
+                self._search_ray((RAY_TOLERANCE, RAY_TOLERANCE), self._exact_ray)
+        elif self.qp.is_singular and is_strict and not is_stopped and has_budget:
+            x, lam = self.judge.x, self.judge.lam
+            assert x is not None and lam is not None
+            if self.program.has_hidden_column(x, lam, self.judge.tol):
+                self._search_ray(self._exact_ray)
         return self._make_answer(begun)
+
+    @property
+    def _exact_ray(self) -> tuple[float, float]:
+        """Tolerances of a ray beside a point that may be a solution: up to rounding, and a slope above tol."""
+        return EXACT_RAY_TOLERANCE, max(self.judge.tol, EXACT_RAY_TOLERANCE)
+
+    def _search_ray(self, *tolerances: tuple[float, float]) -> None:
+        """Search for a ray and a feasible point."""
+        found = find_ray(self.program, self.judge.x, self.deadline, tolerances)
+        if found is not None:
+            self.ray = mark_read_only(found[0])
+            self.judge.x = found[1]
+            self.judge.lam = np.zeros(len(self.qp.target))
 
     def _has_near_solution(self) -> bool:
         """Whether a Newton step from the best point meets tol strictly, so that no proof or ray is to be searched for.

@@ -317,7 +317,8 @@ def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
     lam : (m,)
         Complementary multipliers.
     hidden_error : float
-        The strict error of rows with a right-hand side that counts as rounding, relative to it.
+        The strict error of rows with a right-hand side that counts as rounding, relative to it, and of rows
+        with a right-hand side of 0, relative to the smallest one of the component in scaled units.
     """
     cdef Py_ssize_t i, j, k, c, n = len(x_), m = len(lam_), parts = parts_[1], count
     cdef const double* x = as_double_pointer(x_, n)
@@ -329,7 +330,7 @@ def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
     active_ = np.zeros(m, bool)
     cdef double* lam = as_double_pointer(complementary, m)
     cdef const unsigned char[::1] active = active_.view(np.uint8)
-    cdef Workspace workspace = allocate_bytes((8 * n + 8 * m + 9 * parts + 1) * sizeof(double))
+    cdef Workspace workspace = allocate_bytes((8 * n + 8 * m + 10 * parts + 1) * sizeof(double))
     cdef double* numbers = <double*>workspace.at
     cdef point_t at
     at.a, at.free, at.parts = read_csr(jac, m, n), free, parts
@@ -349,7 +350,8 @@ def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
     cdef double* part_error = numbers + 3 * parts
     cdef double* size = numbers + 4 * parts             # Largest right-hand side that x = 0 violates.
     cdef double* side = numbers + 5 * parts             # Largest right-hand side that x reaches.
-    cdef double* work = numbers + 6 * parts
+    cdef double* least = numbers + 6 * parts            # Smallest right-hand side that is no rounding.
+    cdef double* work = numbers + 7 * parts
     at.active = <unsigned char*>&active[0] if m else NULL
     cdef double v, w, lost, strict = 0.0, hidden = 0.0, necessary = 0.0, terms = 0.0
     cdef errors_t errors
@@ -415,6 +417,12 @@ def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
     if errors.total > max(EXACT, necessary):
         errors = choose_multipliers(&at, lam, given, errors, part_error, work)
     # Strict and hidden errors.
+    for c in range(parts):
+        least[c] = INFINITY
+    for i in range(m):
+        c, v = at.row_part[i], fabs(t[i]) * at.e[i]
+        if v > MIN_PROOF * side[c]:
+            least[c] = min(least[c], v)
     for i in range(m):
         if at.active[i] or at.slack[i] < 0.0:
             v = fabs(at.slack[i]) if at.own[i] > MAX_SIZE_GROWTH * reach[i] else at.excess[i]
@@ -423,6 +431,8 @@ def judge_program(hessian, q_, jac, t_, scales, parts_, lam_, x_, int32_t free):
             if reach[i] != fabs(t[i]) and fabs(t[i]) * at.e[i] > MIN_PROOF * side[at.row_part[i]]:
                 v = fabs(at.slack[i]) if at.own[i] > MAX_SIZE_GROWTH * fabs(t[i]) else at.excess[i]
                 hidden = max(hidden, v / fabs(t[i]))
+            elif t[i] == 0.0:
+                hidden = max(hidden, at.excess[i] * at.e[i] / least[at.row_part[i]])
     for j in range(n):
         w = at.reach[j] if at.reach[j] > 0.0 else at.divisor[j]
         v = fabs((at.gradient[j] - at.force[j]) + (at.gradient_lost[j] - at.force_lost[j]))

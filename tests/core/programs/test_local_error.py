@@ -287,3 +287,58 @@ def test_own_solver_searches_no_proof_on_feasible_programs(solver, monkeypatch):
         arrays = {"P": half @ half.T + np.eye(20), "q": rng.normal(size=20), "G": G}
         answer = lv.solve_qp(**arrays, h=G @ inside + rng.random(30), solver=solver)
         assert answer.found or answer.error < 1e-4
+
+
+@pytest.mark.parametrize("cost", [1.0, 1e6, 1e9, 1e12, 1e16])
+@pytest.mark.parametrize("solver", ["auto", "osqp", "quadprog"])
+def test_cost_of_another_component_hides_no_ray(cost, solver):
+    """min (x_0 - x_1)^2 / 2 - x_0 + cost x_2 with x_2 >= 1 has the ray (1, 1, 0)."""
+    answer = lv.solve_qp(
+        [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]],
+        [-1.0, 0.0, cost],
+        lb=[-np.inf, -np.inf, 1.0],
+        solver=solver,
+    )
+    assert not answer.found
+    assert answer.solution.status is lv.Status.UNBOUNDED
+    # Two roundings of the projection; the entries are of size 1.
+    np.testing.assert_allclose(answer.ray, [1.0, 1.0, 0.0], atol=1e-14)
+
+
+@pytest.mark.parametrize("power", range(2, 9))
+@pytest.mark.parametrize("solver", ["auto", "piqp", "osqp", "quadprog"])
+def test_rounding_of_large_variables_hides_no_ray(power, solver):
+    """P (1, 1) = 0 and q.(1, 1) = -1, which is 10^-power of q; at large x it is rounding of P x."""
+    pytest.importorskip("piqp" if solver == "auto" else solver)
+    large = 10.0**power
+    P = large * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    answer = lv.solve_qp(P, [-large, large - 1.0], G=[[1.0, -1.0]], h=[5.0], solver=solver)
+    assert not answer.found
+
+
+@pytest.mark.parametrize("power", [30, 40, 43])
+@pytest.mark.parametrize("scale", [1e3, 1e6])
+@pytest.mark.parametrize("solver", ["auto", "clarabel", "piqp"])
+def test_direction_of_little_curvature_is_no_ray(power, scale, solver):
+    """P_11 exceeds 1 by 2^-power in units of `scale`: the program has a solution, far along (1, 1, 0)."""
+    pytest.importorskip("piqp" if solver == "auto" else solver)
+    P = np.zeros((3, 3))
+    P[:2, :2] = scale * np.array([[1.0, -1.0], [-1.0, 1.0 + 2.0**-power]])
+    lb = [-np.inf, -np.inf, 1.0]
+    answer = lv.solve_qp(P, [-scale, scale * (1.0 - 1e-6), 1.0], lb=lb, solver=solver)
+    assert answer.solution.status is not lv.Status.UNBOUNDED
+
+
+@pytest.mark.parametrize("solver", ["auto", "osqp", "newton", "pgs"])
+@pytest.mark.parametrize("total", [1e9, 1e10, 1e12])
+def test_rows_with_a_right_hand_side_of_0_hide_no_contradiction(solver, total):
+    """x_0 = x_1, x_1 = x_2 and x_0 = x_2 + 1 contradict each other beside a large sum of x."""
+    answer = lv.solve_qp(
+        np.eye(3),
+        np.zeros(3),
+        A=[[1.0, -1.0, 0.0], [0.0, 1.0, -1.0], [1.0, 0.0, -1.0], [1.0, 1.0, 1.0]],
+        b=[0.0, 0.0, 1.0, total],
+        solver=solver,
+    )
+    assert not answer.found
+    assert answer.solution.status is lv.Status.INFEASIBLE
