@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite solvers.md and the tables of facts in engine.md and engines.md
+    python docs/generate.py --pages    rewrite solvers.md and the table of scenes in engine.md
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 

@@ -1,8 +1,9 @@
-"""Draw the figures of scorecard.md and write its tables, from the table of `python -m benchmarks score`.
+"""Draw the figures of scorecard.md, write its tables and the file of settings, from `python -m benchmarks score`.
 
 python docs/scorecard.py
 """
 
+import csv
 import io
 import math
 import sys
@@ -228,7 +229,7 @@ def make_scene_table():
 def write_options(options):
     """Return options as text."""
     return ", ".join(
-        f"`{k}` {v:g}" if isinstance(v, float) else f"`{k}` {v}" for k, v in options.items()
+        f"{k}={v:g}" if isinstance(v, float) else f"{k}={v}" for k, v in options.items()
     )
 
 
@@ -237,9 +238,9 @@ def make_rule_table():
     return markdown(("knob", "accurate columns"), RULE.items())
 
 
-def make_settings_table():
-    """Return what each row sets of each kind of knob, with sources, and why other kinds are not set."""
-    lines = []
+def make_settings_file():
+    """Return what each row sets of each kind of knob, with sources, and why other kinds are not set, as CSV text."""
+    lines = [("row", "version", "knob", "set to", "source, or reason")]
     for entry in ENGINES.values():
         version = split_requirement(entry.packages[0])[1] if entry.packages else ""
         lines += [
@@ -256,7 +257,9 @@ def make_settings_table():
             lines.append(
                 (entry.title, version, "solver", write_options(entry.common), "in all columns")
             )
-    return markdown(("row", "version", "knob", "set to", "source, or reason"), lines)
+    written = io.StringIO()
+    csv.writer(written, lineterminator="\n").writerows(lines)
+    return written.getvalue()
 
 
 def make_reason_table():
@@ -457,7 +460,6 @@ def make_settings(rows):
     """Return the parts of the page of settings."""
     return {
         "rule": make_rule_table(),
-        "settings": make_settings_table(),
         "reasons": make_reason_table(),
         "missing": make_missing_table(rows),
     }
@@ -483,6 +485,7 @@ def main():
         )
     replace_tables(ROOT / "docs" / "scorecard.md", make_tables(rows))
     replace_tables(ROOT / "docs" / "scorecard-settings.md", make_settings(rows))
+    (STATIC / "settings.csv").write_text(make_settings_file(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 // Steps of Jolt (npm install jolt-physics@1.1.0) as lines of JSON: positions, velocities and contacts before the solve, velocities after it.
-// node jolt_step.mjs [velocity iterations] > jolt-steps.jsonl; docs/read-a-step.md judges them.
+// node jolt_step.mjs [velocity iterations] > jolt-steps.jsonl; examples/read_jolt.py judges them.
 import initJolt from "jolt-physics/wasm-compat";
 
 const J = await initJolt();

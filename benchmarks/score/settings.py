@@ -783,10 +783,9 @@ NOT_RUN: Mapping[str, str] = {
     "DART, PGS": "PgsBoxedLcpSolver has no constructor in Python",
     "newton, Kamino": "a step takes 45 to 59 ms on a CPU: nearly all cells would be too slow",
     "newton, SemiImplicit": "as Featherstone: explicit forces of contacts",
-    "Exudyn": "installed; contacts of boxes need meshes, no adapter yet",
+    "Exudyn, scenes with contacts": "contacts of boxes need meshes",
     "Simbody (opensim)": "installed; its contacts are of meshes and ellipsoids, no adapter yet",
     "Chrono": "no package with the engine: pychrono is another project, projectchrono a reserved name",
-    "planck": "installed; a port of Box2D 2.4, which is in the table",
     "matter-js": "an adapter was written: with true moments of inertia its pendulum explodes, "
     "and neither motors nor belts can be expressed",
 }

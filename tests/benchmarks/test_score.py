@@ -254,6 +254,8 @@ def test_score_pages_have_the_tables_and_sentences_of_records_and_settings(drawi
         text = (ROOT / "docs" / page).read_text(encoding="utf-8")
         for name, part in parts.items():
             assert part in text, (page, name)
+    settings = ROOT / "docs" / "static" / "scorecard" / "settings.csv"
+    assert settings.read_text(encoding="utf-8") == drawing.make_settings_file()
     assert {row.engine for row in rows.values()} == set(drawing.get_engines(rows))
     assert len({ENGINES[name].engine for name in drawing.get_engines(rows)}) >= 19
 

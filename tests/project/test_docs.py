@@ -6,8 +6,6 @@ import json
 import pkgutil
 import re
 import shlex
-import shutil
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -101,88 +99,11 @@ def test_python_of_a_page_runs(page, files, capsys):
             pytest.importorskip(engine, reason=f"the page steps {engine}")
     names = {"np": np, "lv": lv}
     for line, kind, text in blocks(page, "python", "pycon"):
-        if STEPPED_ENGINE.search(text):
-            continue  # The next test runs it, if its engine is installed.
         where = f"{page.name}:{line}"
         if kind == "pycon":
             run_session(text, names, where)
         else:
             exec(compile("\n" * (line - 1) + text, str(page), "exec"), names)
-
-
-STEPPED_ENGINE = re.compile(
-    r"^import (pybullet|pymunk|Box2D|rapier3d|dartpy|robox3d)$|jolt-steps\.jsonl", re.MULTILINE
-)
-ITERATIONS = {
-    "pybullet": "numSolverIterations=",
-    "pymunk": "space.iterations = (0.0, -9.81), ",
-    "Box2D": "world.Step(dt, ",
-}
-
-
-@pytest.mark.parametrize("engine", list(ITERATIONS))
-def test_recording_of_an_engine_has_errors_that_its_iterations_remove(
-    engine, tmp_path, monkeypatch
-):
-    """Direction of the normal, positions, v* and position correction are right: a wrong one leaves an error."""
-    pytest.importorskip(engine)
-    monkeypatch.chdir(tmp_path)
-    texts = [
-        text
-        for *_, text in blocks(ROOT / "docs" / "engines.md", "python")
-        if f"import {engine}\n" in text
-    ]
-    assert len(texts) == 1 and f"{ITERATIONS[engine]}10" in texts[0]
-    errors, left_over = [], []
-    for n in (10, 500):
-        text = (
-            texts[0]
-            .replace(f"{ITERATIONS[engine]}10", f"{ITERATIONS[engine]}{n}")
-            .replace("-steps", f"-{n}")
-        )
-        exec(compile(text, "engines.md", "exec"), {})
-        lines = (tmp_path / f"{engine.lower()}-{n}" / "engine.jsonl").read_text().splitlines()
-        assert len(lines) == 30
-        errors.append(np.median([json.loads(line)["velocity"] for line in lines]))
-        left_over += [json.loads(line)["left_over"] for line in lines]
-    assert errors[1] < 0.1 * errors[0], errors
-    assert (
-        np.median(left_over) < 1e-3 * errors[0]
-    )  # pymunk's friction exceeds the cone in few steps.
-
-
-def read_left_over(text, folder):
-    """Run a loop of docs/read-a-step.md, and return the median of its velocities without a cause [m/s]."""
-    exec(compile(text, "read-a-step.md", "exec"), {})
-    lines = (folder / "engine.jsonl").read_text().splitlines()
-    assert len(lines) >= 30
-    return np.median([json.loads(line)["left_over"] for line in lines])
-
-
-@pytest.mark.parametrize("engine", ["rapier3d", "dartpy", "robox3d", "jolt"])
-def test_impulses_of_contacts_that_are_read_rightly_explain_the_step_of_an_engine(
-    engine, tmp_path, monkeypatch
-):
-    """With bodies a and b swapped, contacts pull: gravity of a step, 0.16 m/s, is left over."""
-    monkeypatch.chdir(tmp_path)
-    if engine == "jolt":
-        (tmp_path / "step.mjs").write_text((ROOT / "examples" / "jolt_step.mjs").read_text())
-        if shutil.which("node") is None or not (ROOT / "examples" / "node_modules").is_dir():
-            pytest.skip("the page steps Jolt in Node")
-        (tmp_path / "node_modules").symlink_to(ROOT / "examples" / "node_modules")
-        run = subprocess.run(["node", "step.mjs"], capture_output=True, text=True, check=True)
-        (tmp_path / "jolt-steps.jsonl").write_text(run.stdout)
-    else:
-        pytest.importorskip(engine)
-    mark = "jolt-steps.jsonl" if engine == "jolt" else f"import {engine}\n"
-    (text,) = (
-        text for *_, text in blocks(ROOT / "docs" / "read-a-step.md", "python") if mark in text
-    )
-    assert read_left_over(text, tmp_path / f"{engine}-steps") < 1e-6  # single precision
-    swapped = re.sub(r"builder\.contact\((\s*)a,(\s+)b,", r"builder.contact(\1b,\2a,", text)
-    assert swapped != text
-    swapped = swapped.replace(f'Recorder("{engine}-steps"', 'Recorder("swapped"')
-    assert read_left_over(swapped, tmp_path / "swapped") > 0.1
 
 
 def test_the_test_of_the_page_on_plug_ins_passes_as_a_file_of_its_own(tmp_path):

@@ -1,5 +1,9 @@
 """The examples run, and the relations that they show hold."""
 
+import json
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -237,6 +241,55 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
     assert not any("damping" in line or "limits" in line for line in lines)
     module.compare(source, source)
     assert "hinge" not in capsys.readouterr().out
+
+
+def read_left_over(folder):
+    """Return the velocities without a cause of the recorded steps [m/s]."""
+    return [
+        json.loads(line)["left_over"] for line in (folder / "engine.jsonl").read_text().splitlines()
+    ]
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "pymunk", "box2d"])
+def test_recording_of_an_engine_has_errors_that_its_iterations_remove(engine, tmp_path):
+    """Direction of the normal, positions, v* and position correction are right: a wrong one leaves an error."""
+    pytest.importorskip("Box2D" if engine == "box2d" else engine)
+    record = example(f"read_{engine}").record
+    few, many = (np.array(record(tmp_path / str(n), n)) for n in (10, 500))
+    assert len(few) == len(many) == 30
+    assert np.median(many) < 0.1 * np.median(few)
+    # pymunk's friction exceeds the cone in few steps.
+    assert np.median(read_left_over(tmp_path / "10")) < 1e-3 * np.median(few)
+
+
+@pytest.mark.parametrize(
+    "name, package",
+    [("rapier", "rapier3d"), ("dart", "dartpy"), ("box3d", "robox3d"), ("jolt", "")],
+)
+def test_impulses_of_contacts_that_are_read_rightly_explain_the_step_of_an_engine(
+    name, package, tmp_path
+):
+    """With bodies a and b swapped, contacts pull: gravity of a step, 0.16 m/s, is left over."""
+    arguments = ()
+    if package:
+        pytest.importorskip(package)
+    else:
+        if shutil.which("node") is None or not (EXAMPLES / "node_modules").is_dir():
+            pytest.skip("the example steps Jolt in Node")
+        command = ["node", str(EXAMPLES / "jolt_step.mjs")]
+        run = subprocess.run(command, capture_output=True, text=True, check=True)
+        arguments = (tmp_path / "jolt-steps.jsonl",)
+        arguments[0].write_text(run.stdout)
+    errors = example(f"read_{name}").record(tmp_path / "steps", *arguments)
+    assert len(errors) >= 30
+    assert np.median(read_left_over(tmp_path / "steps")) < 1e-6  # single precision
+    text = (EXAMPLES / f"read_{name}.py").read_text(encoding="utf-8")
+    swapped = re.sub(r"builder\.contact\((\s*)a,(\s+)b,", r"builder.contact(\1b,\2a,", text)
+    assert swapped != text
+    names = {"__name__": "swapped"}
+    exec(compile(swapped, f"read_{name}.py", "exec"), names)
+    names["record"](tmp_path / "swapped", *arguments)
+    assert np.median(read_left_over(tmp_path / "swapped")) > 0.1
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.py")))
