@@ -107,14 +107,16 @@ def find_different_parts(a: StepRecord, b: StepRecord, pairing: Pairing) -> froz
     arrays = {
         "mass": ("mass", "coriolis", "gravity_map"),
         "force": ("force", "gravity", "stiffness_matrix"),
-        "damping": ("damping_matrix", "damping_force"),
+        "damping": ("damping_matrix", "damping_force", "fluid_matrix"),
         "actuators": ("actuator_matrix", "actuator_force"),
         "method": ("integrator_matrix", "integrator_force"),
     }
     for part, names in arrays.items():
-        if not all(np.array_equal(getattr(a, x), getattr(b, x)) for x in names):
+        if not all(_are_equal(getattr(a, x), getattr(b, x)) for x in names):
             different.add(part)
-    flags = ("uses_damping", "uses_actuators", "uses_stiffness", "in_problem", "implicit_rows")
+    flags = (
+        "uses_damping", "uses_fluid", "uses_actuators", "uses_stiffness", "in_problem", "implicit_rows"
+    )  # fmt: skip
     if any(getattr(a, x) != getattr(b, x) for x in flags):
         different.add("method")
     partners = pairing.partners[0]
@@ -130,6 +132,13 @@ def find_different_parts(a: StepRecord, b: StepRecord, pairing: Pairing) -> froz
     if a.law != b.law:
         different.add("law")
     return frozenset(different)
+
+
+def _are_equal(x: FloatArray | None, y: FloatArray | None) -> bool:
+    """Return whether two arrays are equal by the bit; a missing one is 0."""
+    if x is None or y is None:
+        return not any(np.any(z) for z in (x, y) if z is not None)
+    return np.array_equal(x, y)
 
 
 def _find_different_parts_of_block(x: ConstraintBlock, y: ConstraintBlock) -> set[str]:

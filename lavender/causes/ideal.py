@@ -32,14 +32,20 @@ def make_ideal_twin(record: StepRecord) -> StepRecord:
     )
     has_springs = any(x.softness.rule == "impedance" for x in record.blocks)
     added = record.added_matrix
+    fluid = np.zeros_like(added) if record.fluid_matrix is None else record.fluid_matrix
     if not record.uses_damping:
         added = added + record.dt * record.damping_matrix
+    if not record.uses_fluid:
+        added = added + record.dt * fluid
     symmetric = 0.5 * (added + added.T)  # The problem needs a symmetric matrix.
     dt = record.dt
-    rest = symmetric - dt * (record.damping_matrix + record.uses_actuators * record.actuator_matrix)
+    rest = symmetric - dt * (
+        record.damping_matrix + fluid + record.uses_actuators * record.actuator_matrix
+    )
     rest[np.abs(rest) < 1e-12 * np.abs(record.mass).max()] = 0.0
     twin = replace(
-        record, engine="rigid", blocks=blocks, uses_damping=True, integrator_matrix=rest,
+        record, engine="rigid", blocks=blocks, uses_damping=True, uses_fluid=True,
+        integrator_matrix=rest,
         in_problem=True, implicit_rows=has_springs or record.implicit_rows, law="coulomb", acceleration=None,
         before_noslip=None, softnesses=dict.fromkeys(record.softnesses, rigid),
         settings={"family": "ideal"},

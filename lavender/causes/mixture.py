@@ -270,9 +270,10 @@ def _find_weight(
     if j >= 0 and len(mass.blocks[j].weight) == len(block.weight):
         return mass.blocks[j].weight
     if block.bodies and all(body in mass.weights for body in block.bodies):
-        return np.array([sum(mass.weights[body] for body in block.bodies)])
-    if block.key in mass.weights:
-        return np.full(len(block.weight), mass.weights[block.key])
+        return np.array([sum(float(mass.weights[body]) for body in block.bodies)])
+    known = np.atleast_1d(mass.weights.get(block.key, np.nan))
+    if np.isfinite(known).all():
+        return _resize(known, len(block.weight))
     rows = block.jacobian[: len(block.weight)]
     mine, theirs = (
         np.einsum("ij,ji->i", rows, np.linalg.solve(m, rows.T)) for m in (record.mass, mass.mass)

@@ -75,7 +75,7 @@ class Comparisons:
         """Make the page, with figures in a folder."""
         comparison = self.largest.comparison
         quantities = comparison.list_quantities()
-        cautions = list_cautions(comparison) if quantities else []
+        cautions = list_cautions(comparison)
         facts = comparison.facts
         proposals = (
             [write_proposal(p, comparison) for p in comparison.proposals] if quantities else []
@@ -213,5 +213,5 @@ def list_numbers(comparison: Comparison) -> dict[str, Any]:
         "parts": describe(list(comparison.parts.values())),
         "facts": [{"part": f.part, "text": f.text} for f in comparison.facts],
         "proposals": [{"text": p.text, "left": p.left, "before": p.before} for p in comparison.proposals],
-        "cautions": list_cautions(comparison) if comparison.list_quantities() else [],
+        "cautions": list_cautions(comparison),
     }  # fmt: skip

@@ -31,12 +31,11 @@ def describe(comparison: Difference) -> str:
         head = f"why: {b.engine} against the rigid laws, {dt}, {b.n_rows} rows"
     else:
         head = f"compare: {a.engine} and {b.engine}, {dt}, {a.n_rows} and {b.n_rows} rows"
-    lines = [head]
+    lines = [head, *list_cautions(comparison)]
     quantities = comparison.list_quantities()
     if not quantities:
         largest = float(np.abs(comparison.difference).max(initial=0.0))
         return "\n".join([*lines, f"The velocities are equal to rounding ({largest:.1e})."])
-    lines += list_cautions(comparison)
     for q in quantities:
         first, second = float(q.row @ a.velocity_after), float(q.row @ b.velocity_after)
         values = f"{first:.4g} and {second:.4g}"
@@ -61,18 +60,28 @@ def list_cautions(comparison: Difference) -> list[str]:
     size = float(np.abs(total[i]))
     for name in UNTRUSTED:
         left = float(comparison.parts[name].mean[i])
-        if abs(left) > MAX_SOLVER_PART * size:
+        if abs(left) > max(MAX_SOLVER_PART * size, comparison.rounding) and size > 0.0:
             share = f"{100.0 * abs(left) / size:.0f} % of the largest difference"
             lines.append(f"Caution: {WORDS[name]} makes {share}.")
-    largest = max(
-        (float(np.abs(p.changes[:, i]).max()) for p in comparison.parts.values()), default=0.0
-    )
-    if largest > MAX_PART_RATIO * size:
-        lines.append(
-            f"Caution: single causes change {comparison.a.names[i]} by up to {largest:.2g}, "
-            f"{largest / size:.0f} times the difference: they cancel, and the difference says little about each."
-        )
-    return lines
+    return lines + list_cancelling(comparison)
+
+
+def list_cancelling(comparison: Difference) -> list[str]:
+    """Return a sentence if causes cancel in a velocity, whether its difference is large, small or zero."""
+    total = np.abs(comparison.difference)
+    every = [x for p in comparison.parts.values() for x in (p, *p.parts)]
+    largest = np.max([np.abs(p.changes).max(axis=0) for p in every], axis=0, initial=0.0)
+    # Velocities that nothing moves as much as the largest difference are of no interest.
+    size = max(comparison.rounding, float(total.max(initial=0.0)))
+    cancels = np.flatnonzero((largest > MAX_PART_RATIO * total) & (largest > size))
+    if not len(cancels):
+        return []
+    i = int(cancels[np.argmax(largest[cancels])])
+    times = f"{largest[i] / total[i]:.2g} times" if total[i] > comparison.rounding else "without"
+    more = f", and so {len(cancels) - 1} other velocities" if len(cancels) > 1 else ""
+    changed = f"single causes change {comparison.a.names[i]} by up to {largest[i]:.2g}"
+    end = "they cancel, and the difference says little about each"
+    return [f"Caution: {changed}, {times} a difference{more}: {end}."]
 
 
 def list_part_lines(comparison: Difference, row: FloatArray) -> list[str]:

@@ -20,7 +20,12 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.io import mujoco as single
 from lavender.io.impedance import compute_compliance, compute_reference
 from lavender.io.mujoco_discrete import compute_discrete_matrix
-from lavender.io.mujoco_memory import CHANGED_ADVICE, import_mujoco, read_step
+from lavender.io.mujoco_memory import (
+    CHANGED_ADVICE,
+    OTHER_MODEL_ADVICE,
+    import_mujoco,
+    read_step,
+)
 from lavender.io.start_states import without_sleep
 from lavender.io.step_record import ConstraintBlock, GeomSettings, Softness, StepRecord
 
@@ -32,6 +37,7 @@ MODEL_TOLERANCE = 1e-9
 SMALL_ENTRY = (
     1e-12  # [-] Entries of H below this part of the largest mass are rounding of an inverse.
 )
+EQUALITY_ROWS = 6  # Most rows of an equality: a weld.
 ROTATIONS = (1, 3)  # Values of mjtJoint: ball and hinge.
 
 
@@ -53,7 +59,7 @@ def step_from_mujoco(model: Any, data: Any, *, engine: str | None = None) -> Ste
     Raises
     ------
     InputError
-        The arguments are not a model and its data, or the model has no velocities.
+        The arguments are not a model and its data, the data belong to another model, or the model has no velocities.
     CapabilityError
         The integrator is RK4, which solves the constraints four times in a step; or the simulation diverges.
     """
@@ -70,7 +76,14 @@ def step_from_mujoco(model: Any, data: Any, *, engine: str | None = None) -> Ste
             "integrator RK4 solves the constraints four times in each step, so that one step has no causes: compare "
             "with another integrator"
         )
-    return StepReader(mj, without_sleep(mj, model), data).read(engine or f"MuJoCo {mj.__version__}")
+    read_step(model, data)  # Data of another size are refused.
+    try:
+        reader = StepReader(mj, without_sleep(mj, model), data)
+    except mj.FatalError as error:
+        raise InputError(
+            f"data do not belong to the model ({error}). {OTHER_MODEL_ADVICE}"
+        ) from None
+    return reader.read(engine or f"MuJoCo {mj.__version__}")
 
 
 @dataclass
@@ -107,13 +120,7 @@ class StepReader:
         """Find the names of bodies, geoms and joints."""
         model = self.model
         self.dt, self.nv = float(model.opt.timestep), int(model.nv)
-        self.joints = [_name(model.joint(i), "joint", i) for i in range(model.njnt)]
-        self.bodies = [_name(model.body(i), "body", i) for i in range(model.nbody)]
-        self.owners = list(self.bodies)
-        # Numbers of bodies and geoms change with any other one; joints and places within a body do not.
-        for b in range(model.nbody):
-            if model.body_jntnum[b] and not model.body(b).name:
-                self.bodies[b] = f"body of {self.joints[model.body_jntadr[b]]}"
+        self.joints, self.bodies = name_bodies_and_joints(model)
         self.geoms = [model.geom(i).name or str(i) for i in range(model.ngeom)]
         self.geom_keys = [model.geom(i).name for i in range(model.ngeom)]
         for i in range(model.ngeom):
@@ -162,13 +169,15 @@ class StepReader:
         is_damped = not int(model.opt.disableflags) & int(bits.mjDSBL_EULERDAMP)
         uses_damping, uses_actuators = not is_euler or is_damped, not is_euler
         stiffness = self.read_stiffness()
-        rest = added - dt * (uses_damping * damping + uses_actuators * actuators)
+        fluid = self.read_fluid(mass, added)
+        rest = added - dt * (uses_damping * damping + uses_actuators * (actuators + fluid))
         if self.is_discrete:
             rest -= dt**2 * stiffness
             integrator_force += dt * stiffness @ data.qvel
         rest[np.abs(rest) < SMALL_ENTRY * np.abs(mass).max()] = 0.0
         gravity_map, gravity = self.read_gravity()
-        damping_force, actuator_force = np.array(data.qfrc_damper), np.array(data.qfrc_actuator)
+        damping_force = np.array(data.qfrc_damper) + self.host.qfrc_fluid
+        actuator_force = np.array(data.qfrc_actuator) - self.read_compensation()
         coriolis = np.array(data.qfrc_bias) + self.bias_map @ gravity
         force = smooth - damping_force - actuator_force - (gravity_map @ gravity - coriolis)
         groups = self.read_blocks(mass, added)
@@ -180,6 +189,7 @@ class StepReader:
             actuator_force=actuator_force, integrator_matrix=rest, integrator_force=integrator_force,
             stiffness_matrix=stiffness, uses_stiffness=self.is_discrete,
             uses_damping=uses_damping, uses_actuators=uses_actuators, in_problem=self.is_discrete,
+            fluid_matrix=fluid, uses_fluid=not is_euler, reference_position=np.array(model.qpos0),
             implicit_rows=self.is_discrete, blocks=tuple(g.block for g in groups), law="cone",
             names=names, angular=angular, position=np.array(data.qpos), position_owner=self.find_position_owner(),
             acceleration=np.array(data.qacc), moved_by=moved_by,
@@ -221,6 +231,38 @@ class StepReader:
             inverse[:, i] = (scratch.qvel - self.host.qvel) / self.dt
         return np.linalg.inv(inverse) - mass
 
+    def read_fluid(self, mass: FloatArray, added: FloatArray) -> FloatArray:
+        """Return minus the derivative of the forces of a fluid by the velocity (nv, nv) [N s/m, N m s].
+
+        It is the part of H that leaves without the fluid. Euler's method, which does not use it, has the one of
+        implicitfast.
+        """
+        mj, option = self.mj, self.model.opt
+        if not (option.viscosity or option.density):
+            return np.zeros((self.nv, self.nv))
+        if self.is_discrete:
+            fluid = self.host.efm_fluid
+            matrix = np.zeros((self.nv, self.nv))
+            if len(fluid):
+                rows = np.repeat(np.arange(self.nv), self.model.M_rownnz)
+                matrix[rows, self.model.M_colind] = fluid
+            return (matrix + np.tril(matrix, -1).T) / self.dt
+        own, known = self.model, (int(option.integrator), added)
+        self.model = copy.copy(own)
+        try:
+            if known[0] == int(mj.mjtIntegrator.mjINT_EULER):
+                self.model.opt.integrator = int(mj.mjtIntegrator.mjINT_IMPLICITFAST)
+                known = (0, self.measure_added_matrix(mass))
+            self.model.opt.viscosity = self.model.opt.density = 0.0
+            return (known[1] - self.measure_added_matrix(mass)) / self.dt
+        finally:
+            self.model = own
+
+    def read_compensation(self) -> FloatArray:
+        """Return the part of the actuators' forces (nv,) that compensates gravity, which belongs to the masses."""
+        by_actuators = self.model.jnt_actgravcomp[self.model.dof_jntid].astype(bool)
+        return np.where(by_actuators, self.host.qfrc_gravcomp, 0.0)
+
     def read_damping(self) -> FloatArray:
         """Return the damping matrix (nv, nv) of joints and tendons [N s/m, N m s]."""
         model, bits = self.model, self.mj.mjtDisableBit
@@ -236,14 +278,16 @@ class StepReader:
         return matrix
 
     def read_stiffness(self) -> FloatArray:
-        """Return the stiffness matrix (nv, nv) of the springs of joints and stretched tendons [N/m, N m]."""
+        """Return the stiffness matrix (nv, nv) of the springs of joints and stretched tendons [N/m, N m].
+
+        Ball and free joints have the stiffness on each of their velocities, as in MuJoCo's "discrete".
+        """
         model, bits = self.model, self.mj.mjtDisableBit
         off = int(getattr(bits, "mjDSBL_SPRING", getattr(bits, "mjDSBL_PASSIVE", 0)))
         if int(model.opt.disableflags) & off:
             return np.zeros((self.nv, self.nv))
-        kinds = model.jnt_type[model.dof_jntid]
-        has_angle = kinds >= 2  # A slide or a hinge.
-        matrix = np.diag(np.where(has_angle, model.jnt_stiffness[model.dof_jntid], 0.0))
+        stiffness = np.array(model.jnt_stiffness, float).reshape(model.njnt, -1)[:, 0]
+        matrix = np.diag(stiffness[model.dof_jntid])
         springs = np.flatnonzero(model.tendon_stiffness)
         rows = self.read_tendon_jacobian() if len(springs) else matrix
         for i in springs:
@@ -314,15 +358,17 @@ class StepReader:
             )
             owner = self.joints[j]
             if kind == 0 and not model.joint(j).name:
-                owner = self.owners[int(model.jnt_bodyid[j])]
+                owner = self.bodies[int(model.jnt_bodyid[j])]
             names.append(owner + suffix)
             angular[k] = kind in ROTATIONS or (kind == 0 and place >= 3)
         return tuple(names), angular
 
-    def read_weights(self) -> dict[str, float]:
-        """Return the inverse masses of bodies, and of limits and dry friction of joints and tendons."""
+    def read_weights(self) -> dict[str, float | FloatArray]:
+        """Return the inverse masses of bodies, of equalities, and of limits and dry friction of joints and tendons."""
         model = self.model
-        weights = {n: float(model.body_invweight0[i][0]) for i, n in enumerate(self.bodies)}
+        weights: dict[str, float | FloatArray] = {
+            n: float(model.body_invweight0[i][0]) for i, n in enumerate(self.bodies)
+        }
         for j in range(model.njnt):
             first = float(model.dof_invweight0[model.jnt_dofadr[j]])
             weights |= dict.fromkeys(self.make_limit_keys(j), first)
@@ -331,6 +377,8 @@ class StepReader:
         for i in range(model.ntendon):
             weight = float(model.tendon_invweight0[i])
             weights |= dict.fromkeys(self.make_tendon_keys(i), weight)
+        for i in range(model.neq):
+            weights[self.make_equality_key(i)] = self.weigh_equality(i, EQUALITY_ROWS)
         return weights
 
     def make_limit_keys(self, j: int) -> list[str]:
@@ -370,8 +418,8 @@ class StepReader:
             own = self.make_softness(model.tendon_solref_lim[i], model.tendon_solimp_lim[i])
             result |= dict.fromkeys(limits, own)
         for i in range(model.neq):
-            key = f"equality {_name(model.equality(i), 'number', i)}"
-            result[key] = self.make_softness(model.eq_solref[i], model.eq_solimp[i])
+            own = self.make_softness(model.eq_solref[i], model.eq_solimp[i])
+            result.setdefault(self.make_equality_key(i), own)
         return result
 
     def read_geom_settings(self) -> dict[str, GeomSettings]:
@@ -446,9 +494,9 @@ class StepReader:
         """Return the block of an equality, a limit or dry friction."""
         model, data = self.model, self.data
         jac = self.jacobian[rows]
-        weight = np.full(len(rows), np.nan)
+        weight, position = np.full(len(rows), np.nan), np.zeros(3)
         if kind == EQUALITY:
-            key = f"equality {_name(model.equality(which), 'number', which)}"
+            key, position = self.make_equality_key(which), self.place_equality(which)
             softness = self.make_softness(model.eq_solref[which], model.eq_solimp[which])
             weight = self.weigh_equality(which, len(rows))
         elif kind == FRICTION_DOF:
@@ -480,9 +528,42 @@ class StepReader:
         gap = np.array(data.efc_pos[rows] - data.efc_margin[rows])
         block = ConstraintBlock(
             key, role, jac, gap, weight, softness, margin=float(data.efc_margin[rows[0]]),
-            loss=float(data.efc_frictionloss[rows[0]]), force=np.array(data.efc_force[rows]),
+            loss=float(data.efc_frictionloss[rows[0]]), force=np.array(data.efc_force[rows]), position=position,
         )  # fmt: skip
         return _Rows(block, rows)
+
+    def make_equality_key(self, i: int) -> str:
+        """Return the key of an equality: its name, or its kind and what it connects, which no other one changes."""
+        mj, model = self.mj, self.model
+        if model.equality(i).name:
+            return f"equality {model.equality(i).name}"
+        kind = mj.mjtEq(int(model.eq_type[i])).name.partition("_")[2].lower()
+        types = {int(mj.mjtObj.mjOBJ_SITE): "site", int(mj.mjtObj.mjOBJ_TENDON): "tendon",
+                 int(mj.mjtObj.mjOBJ_FLEX): "flex"}  # fmt: skip
+        known = {int(mj.mjtObj.mjOBJ_BODY): self.bodies, int(mj.mjtObj.mjOBJ_JOINT): self.joints}
+        object_type = int(model.eq_objtype[i])
+        names = []
+        for number in (int(model.eq_obj1id[i]), int(model.eq_obj2id[i])):
+            if number >= 0 and object_type in known:
+                names.append(known[object_type][number])
+            elif number >= 0:
+                word = types.get(object_type, "object")
+                name = mj.mj_id2name(model, object_type, number)
+                names.append(name or f"{word} {number}")
+        return f"equality {kind} between {' and '.join(names)}"
+
+    def place_equality(self, i: int) -> FloatArray:
+        """Return the position of an equality (3,) [m], by which those of the same bodies are matched."""
+        mj, model, data = self.mj, self.model, self.host
+        kinds = int(mj.mjtEq.mjEQ_CONNECT), int(mj.mjtEq.mjEQ_WELD)
+        first = int(model.eq_obj1id[i])
+        if int(model.eq_type[i]) not in kinds:
+            return np.zeros(3)
+        if int(model.eq_objtype[i]) == int(mj.mjtObj.mjOBJ_SITE):
+            return np.array(data.site_xpos[first])
+        frame = np.array(data.xmat[first]).reshape(3, 3)
+        place: FloatArray = data.xpos[first] + frame @ model.eq_data[i, :3]
+        return place
 
     def weigh_equality(self, which: int, count: int) -> FloatArray:
         """Return the inverse masses (count,) of the rows of an equality; nan if the kind is not known here."""
@@ -666,6 +747,34 @@ def _gather_force(
     if not is_pyramid or condim == 1:
         return np.array(force)
     return np.append(force.sum(), friction[: condim - 1] * (force[0::2] - force[1::2]))
+
+
+def name_bodies_and_joints(model: Any) -> tuple[list[str], list[str]]:
+    """Return names of joints and bodies. Without a name, they are known by their places, which few others change.
+
+    A body without a name has the one of its first joint, or its number among the bodies of the same parent that have
+    neither a name nor a joint with a name and the same number of joints. A joint has its number in the body.
+    """
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    bodies: list[str] = []
+    counts: dict[tuple[str, int], int] = {}
+    for b in range(model.nbody):
+        name, first, count = (
+            model.body(b).name,
+            int(model.body_jntadr[b]),
+            int(model.body_jntnum[b]),
+        )
+        if not name and count and joints[first]:
+            name = f"body of {joints[first]}"
+        if not name:
+            parent = bodies[int(model.body_parentid[b])]
+            place = counts[parent, count] = counts.get((parent, count), -1) + 1
+            kind = "moving" if count else "fixed"
+            name = f"{parent}/{kind} body {place}"
+        bodies.append(name)
+        for k in range(count):
+            joints[first + k] = joints[first + k] or f"{name}/joint {k}"
+    return joints, bodies
 
 
 def _name(element: Any, kind: str, number: int) -> str:

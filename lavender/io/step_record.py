@@ -14,11 +14,12 @@ acceleration and a compliance R depend on the mass, on the position of the row a
 in `lavender.causes.mixture` from `Softness`, `ConstraintBlock.weight`, `gap` and `friction`. The force is the sum
 
     f = -coriolis + gravity_map gravity + force + damping_force + actuator_force + integrator_force              (3)
-    H = h (damping_matrix + actuator_matrix) + h^2 stiffness_matrix + integrator_matrix                          (4)
+    H = h (damping_matrix + fluid_matrix + actuator_matrix) + h^2 stiffness_matrix + integrator_matrix           (4)
 
-where coriolis and gravity_map belong to the masses, damping_force and damping_matrix to the joints' and tendons'
-dampings, actuator_force and actuator_matrix to the actuators, and integrator_force to the integrator. An integrator
-uses some of the first three terms of H. If it uses the springs' stiffness, f has also -h stiffness_matrix v.
+where coriolis and gravity_map belong to the masses, damping_force, damping_matrix and fluid_matrix to the dampings of
+joints, tendons and fluids, actuator_force and actuator_matrix to the actuators, and integrator_force to the integrator.
+An integrator uses some of the first four terms of H. If it uses the springs' stiffness, f has also -h stiffness_matrix
+v.
 """
 
 from __future__ import annotations
@@ -228,10 +229,16 @@ class StepRecord:
         The engine's own acceleration in the constraint problem.
     moved_by : {"forces", "acceleration"}
         The part of the engine's answer that its integrator uses.
+    fluid_matrix : (nv, nv), optional
+        Minus the derivative of a fluid's forces by the velocity [N s/m, N m s]; they are part of `damping_force`.
+    uses_fluid : bool
+        Whether the integrator is implicit in the fluid's forces.
+    reference_position : (nq,), optional
+        Positions at which the joints are in the model's initial pose.
     before_noslip : tuple of arrays, optional
         Forces of the blocks before the engine's pass against slip, if it has one.
     weights : dict
-        Inverse masses of bodies and of other constraints, by body or key.
+        Inverse masses of bodies and of other constraints, by body or key; of equalities with all their rows.
     softnesses : dict
         Softness by the key of constraints that are not active in this step.
     geom_settings : dict
@@ -271,7 +278,10 @@ class StepRecord:
     acceleration: FloatArray | None = None
     moved_by: str = "forces"
     before_noslip: tuple[FloatArray, ...] | None = None
-    weights: Mapping[str, float] = field(default_factory=dict)
+    fluid_matrix: FloatArray | None = None
+    uses_fluid: bool = False
+    reference_position: FloatArray | None = None
+    weights: Mapping[str, float | FloatArray] = field(default_factory=dict)
     softnesses: Mapping[str, Softness] = field(default_factory=dict)
     geom_settings: Mapping[str, GeomSettings] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -326,6 +336,8 @@ def add_matrix(
     added = method.integrator_matrix
     if method.uses_damping:
         added = added + dt * damping.damping_matrix
+    if method.uses_fluid and damping.fluid_matrix is not None:
+        added = added + dt * damping.fluid_matrix
     if method.uses_actuators:
         added = added + dt * actuators.actuator_matrix
     return added + dt**2 * force.stiffness_matrix if method.uses_stiffness else added
@@ -474,13 +486,20 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
         "actuator_matrix",
         "stiffness_matrix",
         "integrator_matrix",
+        "fluid_matrix",
     ):
-        changed[name] = getattr(record, name)[np.ix_(order, order)]
+        value = getattr(record, name)
+        changed[name] = None if value is None else value[np.ix_(order, order)]
     blocks = tuple(replace(b, jacobian=b.jacobian[:, order]) for b in record.blocks)
     if record.position is not None and record.position_owner is not None:
         owner = np.argsort(order)[record.position_owner]
         places = np.argsort(owner, kind="stable")
-        changed |= {"position": record.position[places], "position_owner": owner[places]}
+        at_rest = record.reference_position
+        changed |= {
+            "position": record.position[places],
+            "position_owner": owner[places],
+            "reference_position": None if at_rest is None else at_rest[places],
+        }
     elif (order != np.arange(n)).any():
-        changed["position"] = None
+        changed |= {"position": None, "reference_position": None}
     return replace(record, **changed, blocks=blocks, names=names)

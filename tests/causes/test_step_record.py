@@ -267,3 +267,140 @@ def test_both_quaternions_of_a_rotation_are_one_state():
     wrong = replace(other, position=other.position * [1, 1, 1, 1, -1, 1, 1])
     with pytest.raises(lv.InputError, match="start from the same state"):
         lv.compare(one, wrong)
+
+
+BALL_AND_FREE = """<mujoco><option integrator="{}"/><worldbody>
+<body><joint name="ball" type="ball" stiffness="30" damping="0.3"/><geom size="0.1" pos="0.2 0 0"/></body>
+<body pos="1 0 1"><joint name="free" type="free" stiffness="20" damping="0.1"/>
+<geom size="0.1 0.2 0.3" type="ellipsoid"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "implicit", "discrete"])
+@pytest.mark.parametrize(("array", "at", "value", "cause"), [
+    ("jnt_stiffness", (0, ...), 60.0, "force"),
+    ("jnt_stiffness", (1, ...), 50.0, "force"),
+    ("opt.viscosity", (), 1.0, "integrator"),
+    ("opt.density", (), 100.0, "integrator"),
+])  # fmt: skip
+def test_springs_are_forces_and_fluids_are_dampings(integrator, array, at, value, cause):
+    def change(model, data):
+        data.qpos[:3] += 0.3
+        mujoco.mj_integratePos(model, data.qpos, np.linspace(-0.3, 0.3, model.nv), 1.0)
+        if on:
+            owner, _, name = array.rpartition(".")
+            if owner:
+                setattr(model.opt, name, value)
+            else:
+                getattr(model, name)[at] = value
+
+    on = False
+    one = read_text(BALL_AND_FREE.format(integrator), change)
+    on = True
+    found = lv.compare(one, read_text(BALL_AND_FREE.format(integrator), change))
+    size = np.abs(found.difference).max()
+    assert size > 1e-5
+    # MuJoCo's "discrete" turns free bodies by implicit gyroscopic forces, which the springs' matrix changes.
+    for name, part in found.parts.items():
+        assert name == cause or np.abs(part.mean).max() < 0.01 * size, name
+
+
+CONNECT = '<connect body1="b" anchor="0.4 0 0.01" solref="0.05 1"/>'
+SECOND_CONNECT = '<connect body1="b" anchor="0.1 0 0.02" solref="0.03 1"/>'
+WELD = '<weld body1="b" solref="0.1 1"/>'
+COUPLING = '<joint joint1="j" joint2="k" polycoef="0.1 1 0 0 0"/>'
+ARM = """<mujoco><option integrator="%s"/><worldbody>
+<body name="a" pos="0 0 1"><joint name="j" axis="0 1 0"/><geom size="0.05" pos="0.2 0 0"/>
+<body name="b" pos="0.4 0 0"><joint name="k" axis="0 1 0"/><geom size="0.05" pos="0.2 0 0"/></body></body>
+</worldbody><equality>%s</equality></mujoco>"""
+
+
+def shift(model, data):
+    data.qpos[:] += [0.1, -0.05]
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "discrete"])
+@pytest.mark.parametrize("equality", [CONNECT, WELD, COUPLING])
+def test_equality_that_is_off_has_the_weight_of_the_other_masses(integrator, equality):
+    def read_arm(factor, is_active):
+        def change(model, data):
+            shift(model, data)
+            model.body_mass[1] *= factor
+            model.body_inertia[1] *= factor
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+            data.eq_active[0] = is_active
+
+        return read_text(ARM % (integrator, equality), change)
+
+    steps = [read_arm(*x) for x in ((1, True), (3, True), (1, False), (3, False))]
+    none, mass, off, both = (x.velocity_after for x in steps)
+    parts = lv.compare(steps[0], steps[3]).parts
+    for name, alone, last in (("mass", mass - none, both - off), ("rows", off - none, both - mass)):
+        np.testing.assert_allclose(parts[name].mean, 0.5 * (alone + last), rtol=0, atol=1e-10)
+        assert np.abs(alone - last).max() > 1e-4
+
+
+def test_order_of_equalities_without_names_changes_nothing():
+    own = [CONNECT, SECOND_CONNECT, WELD, COUPLING]
+    one = read_text(ARM % ("Euler", "".join(own)), shift)
+    other = read_text(ARM % ("Euler", "".join(own[::-1])), shift)
+    found = lv.compare(one, other)
+    assert not found.pairing.list_unmatched(0) and not found.facts
+    assert max(np.abs(p.changes).max() for p in found.parts.values()) < 1e-9
+
+
+@pytest.mark.parametrize("by_actuators", ["false", "true"])
+def test_compensated_gravity_belongs_to_masses(by_actuators):
+    text = f"""<mujoco><worldbody><body name="a" pos="0 0 1" gravcomp="0.7"><joint name="j" axis="0 1 0"
+    actuatorgravcomp="{by_actuators}"/><geom size="0.05" pos="0.2 0 0"/></body></worldbody>
+    <actuator><position joint="j" kp="3"/></actuator></mujoco>"""
+
+    def change(model, data):
+        data.qpos[:] = 0.4  # The actuator pulls.
+        model.body_mass[1] *= factor
+        model.body_inertia[1] *= factor
+
+    factor = 1
+    light = read_text(text, change)
+    factor = 3
+    found = lv.compare(light, read_text(text, change))
+    assert np.abs(found.difference).max() > 1e-3
+    others = [p.changes for name, p in found.parts.items() if name != "mass"]
+    assert max(np.abs(x).max() for x in others) < 1e-12
+
+
+def test_another_ref_is_refused():
+    text = """<mujoco><worldbody><body><joint name="j" axis="0 1 0" ref="{}"/><geom size="0.1" pos="1 0 0"/></body>
+    </worldbody></mujoco>"""
+
+    def set_position(model, data):
+        data.qpos[:] = 0.1
+
+    with pytest.raises(lv.InputError, match=r"ref of j is 0 in a and 0\.349066 in b"):
+        lv.compare(*(read_text(text.format(x), set_position) for x in (0, 20)))
+
+
+def test_data_of_another_model_are_refused():
+    one, other = (mujoco.MjModel.from_xml_string(x) for x in (ARM % ("Euler", ""), TILTED_BOX % ""))
+    same_size = mujoco.MjModel.from_xml_string(ARM % ("Euler", CONNECT + WELD))
+    for model, data in ((one, other), (other, one), (one, same_size)):
+        with pytest.raises(lv.InputError, match=r"belong"):
+            lv.io.step_from_mujoco(model, mujoco.MjData(data))
+
+
+def test_causes_that_leave_no_difference_are_said():
+    found, _ = push_without_rows(100.0, -100.0)
+    text = str(found).splitlines()
+    assert "they cancel" in text[1] and "equal to rounding" in text[2]
+
+
+@pytest.mark.parametrize("solver", ["CG", "PGS"])
+def test_solver_that_stops_early_has_lost_no_digits(solver):
+    boxes = "".join(
+        f'<body pos="0 0 {0.049 + 0.098 * i}"><freejoint/>'
+        f'<geom type="box" size=".05 .05 .05" mass="{1 + 5 * i}"/></body>'
+        for i in range(3)
+    )
+    text = f"""<mujoco><option integrator="implicitfast" iterations="1" solver="{solver}"/><worldbody>
+    <geom type="plane" size="3 3 .1"/>{boxes}</worldbody></mujoco>"""
+    parts = lv.compare(read_text(text)).parts
+    assert np.abs(parts["solver"].mean).max() > 1e-3 and not parts["lost digits"].mean.any()
