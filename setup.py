@@ -20,9 +20,11 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
 import sys
 import sysconfig
 import tarfile
+from functools import cache
 from pathlib import Path
 
 import Cython
@@ -185,11 +187,24 @@ class BuildKernels(build_ext):
         super().run()
 
 
+def find_compiler():
+    """Return the command of the C compiler that setuptools selects; empty on Windows."""
+    return shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "")
+
+
+@cache
+def is_known(option):
+    """Return whether the C compiler knows an option; clang stops at some of gcc's."""
+    command = [*find_compiler(), "-Werror", option, "-E", "-x", "c", os.devnull]
+    try:
+        return not subprocess.run(command, capture_output=True, check=False).returncode
+    except OSError:  # check_compiler says so, if something is to be compiled.
+        return False
+
+
 def check_compiler():
     """Raise CompileError without a C compiler or Python's headers, before minutes of translation."""
-    command = shlex.split(
-        os.environ.get("CC") or sysconfig.get_config_var("CC") or ""
-    )  # as setuptools selects it
+    command = find_compiler()
     if command and not shutil.which(command[0]):
         raise CompileError(
             f"the kernels are C, and no compiler {command[0]!r} is found: install one (Debian and Ubuntu: "
@@ -360,7 +375,7 @@ def extension(path):
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
         include_dirs=[path.parent.as_posix()],  # headers of C that several widths of vectors share
-        extra_compile_args=[*COMPILE_ARGS, *options],
+        extra_compile_args=[*COMPILE_ARGS, *filter(is_known, options)],
         extra_link_args=LINK_ARGS,
     )
 
