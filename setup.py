@@ -28,6 +28,7 @@ from functools import cache
 from pathlib import Path
 
 import Cython
+import numpy
 from Cython.Build import cythonize
 from Cython.Build.Dependencies import DependencyTree
 from setuptools import Command, Extension, setup
@@ -374,7 +375,8 @@ def extension(path):
     return Extension(
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
-        include_dirs=[path.parent.as_posix()],  # headers of C that several widths of vectors share
+        # headers of C that several widths of vectors share, and those of NumPy
+        include_dirs=[path.parent.as_posix(), numpy.get_include()],
         extra_compile_args=[*COMPILE_ARGS, *filter(is_known, options)],
         extra_link_args=LINK_ARGS,
     )

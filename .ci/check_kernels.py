@@ -10,7 +10,7 @@ names the functions that need them.
 
 The sources are checked as well: signatures of core functions must be fixed-width and `noexcept nogil`, and directives
 may be set in lavender_ext/build_options.py only. The C is checked as strict C11 (`DIALECT`), as gcc and clang compile
-it and as a compiler without vector types does: the only permitted warning is `CYTHONS_OWN`.
+it and as a compiler without vector types does: the only permitted warning is `TABLES`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ import sysconfig
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+import numpy
 
 ROOT = Path(__file__).resolve().parent.parent
 OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
@@ -41,8 +43,10 @@ DIALECT = [
 ]
 #: Selects the branch without vector types of every `#if defined(__GNUC__)` in the kernels.
 PLAIN = ["-DLAVENDER_ONE_LANE"]
-#: Warning from code that Cython writes into each module: function tables for other modules, as object pointers.
-CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
+#: Warnings from function tables that Cython writes for other modules, and from that of NumPy's headers.
+TABLES = re.compile(
+    "ISO C forbids conversion of (function|object) pointer to (object|function) pointer type"
+)
 
 #: Types with the same size on every platform, so that a host outside C can build them; struct names also end in _t.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
@@ -117,7 +121,11 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
 def read_dialect(c_file: Path) -> list[str]:
     """Return the warnings of the C compiler about nonstandard C, except those of Cython's own tables."""
     compiler = shlex.split(os.environ.get("CC", "cc"))
-    folders = [sysconfig.get_paths()["include"], str(ROOT / "lavender_ext" / "batch")]
+    folders = [
+        sysconfig.get_paths()["include"],
+        str(ROOT / "lavender_ext" / "batch"),
+        numpy.get_include(),
+    ]
     found: dict[str, None] = {}
     text = c_file.read_text(encoding="utf-8")
     guarded = PLAIN[0].removeprefix("-D") in text or '"lanes.h"' in text
@@ -140,7 +148,7 @@ def read_dialect(c_file: Path) -> list[str]:
             line for line in done.stderr.splitlines() if re.search(r"\b(warning|error):", line)
         ]
         found.update(
-            dict.fromkeys(line.partition(": ")[2] for line in lines if CYTHONS_OWN not in line)
+            dict.fromkeys(line.partition(": ")[2] for line in lines if not TABLES.search(line))
         )
         if done.returncode and not found:
             raise RuntimeError(f"{shlex.join(command)} failed:\n{done.stderr}")
