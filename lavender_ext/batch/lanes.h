@@ -54,8 +54,10 @@ static void lavender_list_columns(unsigned long long set, int* list) {
 #define LAVENDER_FROM(V, j) (sizeof(V) == sizeof(double) ? ((j) + 1) & ~3 : (j) + 1)
 #if defined(__clang__)
 #define LAVENDER_APART _Pragma("clang loop vectorize(assume_safety)")
+#define LAVENDER_AVX512 __attribute__((target("avx512f,avx512dq,avx512vl"), __min_vector_width__(512)))
 #elif defined(__GNUC__)
 #define LAVENDER_APART _Pragma("GCC ivdep")
+#define LAVENDER_AVX512 __attribute__((target("avx512f,avx512dq,avx512vl,prefer-vector-width=512")))
 #else
 #define LAVENDER_APART
 #endif
@@ -115,7 +117,7 @@ LAVENDER_VECTOR(8, lanes_8, mask_8)
 #define WIDTH 8
 #define V lanes_8
 #define I mask_8
-#define ISA __attribute__((target("avx512f,avx512dq,avx512vl,prefer-vector-width=512")))
+#define ISA LAVENDER_AVX512
 #define ROOT(a) ((lanes_8)_mm512_sqrt_pd((__m512d)(a)))
 #define PICK LAVENDER_PICK
 #define ABS LAVENDER_ABS
