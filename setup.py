@@ -54,7 +54,7 @@ SHARED = "lavender_ext._utility"
 HOT = ("sweep/", "local/", "driver/driver", "engine/substep")
 #: Modules compiled with -O3 and lower inlining limits: at -O2 a factorisation takes twice as long, and a solve of few
 #: bodies by Newton's method 1.2 to 1.3 times, also with -fpeel-loops.
-FAST = ("factor/linear", "judge/convex", "judge/measure", "judge/program", "newton/solve")
+FAST = ("factor/linear", "program/rows", "judge/measure", "program/error", "newton/solve")
 #: Modules without expensive loops: -O1, half of the compile time of -O2. All others are compiled at -O2 with gcc's full
 #: vectoriser; solve times stay within 1 % of those at -O3, which takes a sixth longer to compile.
 COLD = (

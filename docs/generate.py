@@ -395,7 +395,7 @@ def solver_overview():
 
 def tabulate_backends(specs):
     """Return the table of backends: method, version, start, and the programs that a backend does not solve."""
-    from lavender.external import backends as b
+    from lavender.programs import backends as b
 
     programs = (
         "repeated",
@@ -461,7 +461,7 @@ package either, and were observed with builds of their sources."""
 
 def backend_observations():
     """Return the parts of the page of backends that list their observed behaviour."""
-    from lavender.external import backends as b
+    from lavender.programs import backends as b
 
     seen = [x for x in b.BACKENDS if x.behaviour is not None]
     verdicts = ["version", "triangle", "start", "repeated", "dependent", "contradictory"]
@@ -540,7 +540,7 @@ def solver_pages(site, report, figures):
         solver_page(site, spec, report, figures)
     parts = [
         "# Backends of other packages",
-        docstrings.markdown(sys.modules["lavender.external.backends"].__doc__),
+        docstrings.markdown(sys.modules["lavender.programs.backends"].__doc__),
         "Each runs under its own name. One that is not installed says what to install. Options of all of them:",
         table(
             ("option", "meaning"),
@@ -759,7 +759,6 @@ API_TITLES = {
     "problem": "Problems",
     "judge": "Judge",
     "batch": "Batches",
-    "external": "Quadratic programs",
     "programs": "Quadratic programs",
     "gradient": "Derivatives",
     "causes": "Causes of differences between engines",

@@ -30,9 +30,9 @@ from lavender.base.errors import (
 )
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.backends import BACKENDS
 from lavender.problem import Problem as ConstraintProblem
 from lavender.programs import quadratic
+from lavender.programs.backends import BACKENDS
 from lavender.solvers.registry import available
 
 __all__ = [

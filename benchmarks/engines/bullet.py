@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.engines import Stepping, get_collision_shape
 from lavender.base.arrays import FloatArray
-from lavender.external.running import quiet
+from lavender.programs.running import quiet
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import convert_to_rotation_matrix
 

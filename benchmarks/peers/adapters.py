@@ -2,7 +2,7 @@
 
 A contestant solves a problem with increasingly tight settings of its own. Each run gives a CPU time and an impulse; the
 time to an error is the smallest time of a run that reaches it by the judge, whatever its setting. A contestant gets a
-problem in its better form (impulse or velocity form of `lavender.external.forms`, scaled, in its own data layout).
+problem in its better form (impulse or velocity form of `lavender.programs.forms`, scaled, in its own data layout).
 Only the call of its interface is timed, not conversion and judging.
 """
 
@@ -26,14 +26,14 @@ from benchmarks.peers.backend_time import measure_backend_time
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.backend import Backend
-from lavender.external.backends import BACKENDS
-from lavender.external.forms import PROGRAM_FORMS, Form, build_form
-from lavender.external.qp_solver import QPSolver, explain_refusal
-from lavender.external.running import Limits
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
+from lavender.programs.backend import Backend
+from lavender.programs.backends import BACKENDS
+from lavender.programs.forms import PROGRAM_FORMS, Form, build_form
+from lavender.programs.qp_solver import QPSolver, explain_refusal
+from lavender.programs.running import Limits
 from lavender.solving.prepared import prepare
 
 TARGETS = (1e-3, 1e-6, 1e-9)  # relative residuals to reach
@@ -97,7 +97,7 @@ def _impulse(form: Form, x: FloatArray | None, lam: FloatArray | None) -> FloatA
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
-    """Return the runs of a backend called by `lavender.external`; `own`: only its own set-up and solve are timed."""
+    """Return the runs of a backend called by `lavender.programs`; `own`: only its own set-up and solve are timed."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         built = QPSolver(backend, form=form).prepare(problem)

@@ -15,7 +15,7 @@ from typing import Any
 SETUP_METHODS = ("setup", "init")  # Methods of the backends' classes that receive the data.
 
 #: Functions of each backend that are timed, as "module:class.method" or "module:function". These are the names by
-#: which lavender.external and qpsolvers call them.
+#: which lavender.programs and qpsolvers call them.
 BACKEND_ENTRY_POINTS = {
     "clarabel": ("clarabel:DefaultSolver.solve",),
     "clarabel_cone": ("clarabel:DefaultSolver.solve",),

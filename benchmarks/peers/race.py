@@ -10,9 +10,9 @@ from time import monotonic
 from typing import Any
 
 from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
-from lavender.external.running import quiet
 from lavender.judge.residuals import residual
 from lavender.problem import Problem
+from lavender.programs.running import quiet
 from lavender.report.timing import limit_to_one_thread
 
 REPEATS, REPEAT_TIME = 30, 0.1  # repeats of one setting: maximum number, and maximum total time [s]

@@ -2,7 +2,7 @@
 
     python findings/probes/backend_probes.py [BACKEND ...]
 
-prints the observed behaviour of each installed backend, for the table of `lavender/external/backends.py`.
+prints the observed behaviour of each installed backend, for the table of `lavender/programs/backends.py`.
 """
 
 import contextlib
@@ -402,7 +402,7 @@ def main():
     """Print the observed behaviour of the backends named on the command line, by default of all."""
     import qpsolvers
 
-    from lavender.external.backends import BACKENDS
+    from lavender.programs.backends import BACKENDS
 
     packages = {b.name: b.modules[-1] for b in BACKENDS}
     for name in sys.argv[1:] or qpsolvers.available_solvers:

@@ -1,10 +1,10 @@
-"""Installed backends behave as the table of `lavender/external/backends.py` records."""
+"""Installed backends behave as the table of `lavender/programs/backends.py` records."""
 
 import pytest
 from backend_probes import BEHAVIOUR_PROBES, NOTE_PROBES
 from reuse_probes import REUSE_PROBES, find_after_others, find_in_threads
 
-from lavender.external import backends
+from lavender.programs import backends
 
 OBSERVED = {b.name: b for b in backends.BACKENDS if b.behaviour is not None}
 

@@ -59,8 +59,8 @@ def _describe_solver(name: str) -> None:
     """Print summary, reference, capabilities, options and observed behaviour of a solver."""
     from importlib.metadata import version
 
-    from lavender.external.backends import describe_backend, get_behaviour
     from lavender.problem import LAWS, OPERATORS
+    from lavender.programs.backends import describe_backend, get_behaviour
     from lavender.solvers import registry
 
     if name not in registry.specs():

@@ -57,9 +57,14 @@ from lavender.problem.generalized import (
     extract_lower_triangle,
 )
 from lavender_ext.core.assemble import dense_to_csr, mirror_lower_triangle
-from lavender_ext.judge.convex import split_multipliers, stack_program
 from lavender_ext.judge.measure import all_finite
-from lavender_ext.judge.program import equilibrate_program, find_components, judge_program
+from lavender_ext.program.error import (
+    TERM_ROUNDING,
+    equilibrate_program,
+    find_components,
+    judge_program,
+)
+from lavender_ext.program.rows import INFINITE, split_multipliers, stack_program
 
 IntArray = npt.NDArray[np.int32]
 IntpArray = npt.NDArray[np.intp]
@@ -69,10 +74,6 @@ MAX_SINGULAR_PIVOT = 1e-13
 # P counts as semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor. The shift covers negative
 # eigenvalues that rounding causes.
 SEMIDEFINITE_SHIFT = 1e-12
-INFINITE = 1e20  # A right-hand side or bound of this size or larger counts as infinite, as in other packages.
-# A row without coefficients holds if x = 0 violates it by at most this multiple of the largest right-hand side of the
-# rows with coefficients: 16 unit roundoffs, as for the terms of a row.
-EMPTY_ROW_ROUNDING = 2.0**-49
 IMPOSSIBLE_SIDE = 1.0  # Right-hand side of a row G x <= -inf, which becomes 0 >= 1.
 MAX_NAMED_ROWS = 8  # A message names up to this many rows.
 MAX_PROGRAM_ASYMMETRY = (
@@ -200,7 +201,7 @@ class QPSolution:
 
         An inequality is active if its multiplier, relative to its columns, exceeds its slack, relative to its row;
         otherwise its multiplier counts as 0. Rounding of the own terms of a row or column counts as 0, and no divisor
-        depends on another component: `lavender_ext/judge/program.pyx` has the formulas.
+        depends on another component: `lavender_ext/program/error.pyx` has the formulas.
         """
         return float(self._judged[0])
 
@@ -379,7 +380,7 @@ class QuadraticProgram:
     def clear_rounding_of_empty_rows(self) -> None:
         """Set right-hand sides of a new program's rows without coefficients to 0 if they are rounding of the others.
 
-        They are if x = 0 violates them by at most EMPTY_ROW_ROUNDING of the largest right-hand side of the rows of A
+        They are if x = 0 violates them by at most TERM_ROUNDING of the largest right-hand side of the rows of A
         and G with coefficients. A warning names the rows. `target` becomes read-only.
         """
         ptr, _, value = self.jacobian
@@ -389,7 +390,7 @@ class QuadraticProgram:
             is_empty = self._is_empty_row
             largest = np.abs(target).max(initial=0.0, where=is_general & ~is_empty)
             is_rounding = is_empty & is_general & self._violates_zero
-            is_rounding &= np.abs(target) <= EMPTY_ROW_ROUNDING * largest
+            is_rounding &= np.abs(target) <= TERM_ROUNDING * largest
             if self.has_impossible_rows:
                 is_rounding &= target != IMPOSSIBLE_SIDE
             if is_rounding.any():

@@ -1,6 +1,6 @@
 """`solve_qp`: quadratic programs by backends, `auto` or another solver, judged in the program's own terms.
 
-A named backend receives the program in scaled variables, and its x is kept (`lavender/external`). `auto` solves a
+A named backend receives the program in scaled variables, and its x is kept (`lavender/programs`). `auto` solves a
 program with a positive definite P as a constraint problem in J and M first, and then calls backends until the error
 meets tol. Other solvers solve the constraint problem. A point that does not meet tol is followed by a search for a
 proof that there is no solution (`proofs.py`).
@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,15 +22,7 @@ from lavender.base.arrays import FloatArray, as_array, check_float, mark_read_on
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.forms import get_program
-from lavender.external.proofs import (
-    EXACT_RAY_TOLERANCE,
-    RAY_TOLERANCE,
-    find_infeasibility_proof,
-    find_ray,
-)
-from lavender.external.qp_solver import OPTION_HELP, ProgramJudge, QPSolver, get_false_claim_error
-from lavender.judge.certificates import Proof, prove_infeasibility
+from lavender.judge.certificates import Proof
 from lavender.judge.residuals import residual
 from lavender.judge.solution import (
     CONFIRMED,
@@ -45,29 +37,19 @@ from lavender.judge.solution import (
     sum_work_counts,
 )
 from lavender.problem import Problem, QPSolution
-from lavender.problem.program import QuadraticProgram, make_quadratic_program
-from lavender.solvers.registry import SolverSpec, get
+from lavender.problem.program import make_quadratic_program
+from lavender.programs.judges import is_false_claim
+from lavender.programs.qp_solver import OPTION_HELP
+from lavender.programs.task import MIN_TOL, ProgramTask, Run
+from lavender.solvers.registry import SolverSpec, get, program_backends
 from lavender.solving.limits import check_time_limit
-from lavender.solving.singular_programs import program_backends
 from lavender.solving.solve import solve
 
-MIN_TOL = 1e-13  # Smallest error that further solves are to reach; smaller ones are rounding.
 MAX_SOLVES = 5  # Maximum number of solves of one constraint problem, each with a smaller tol.
 # The next tol is this fraction of the tol that would suffice if the program's error were proportional to tol.
 TOL_RATIO = 0.1
 # `auto` solves the constraint problem to this fraction of tol: Newton's last steps cost less than a step in SciPy.
 AUTO_TOL_RATIO = 1e-3
-
-
-class Run(NamedTuple):
-    """One solver that ran on a program, and its claim."""
-
-    name: str
-    status: Status
-    message: str
-    work: dict[str, int]
-    error: float  # Smallest error of the program after the run.
-    form: str = "program"
 
 
 def solve_qp(
@@ -178,121 +160,41 @@ def solve_qp(
             {"verbose": True} if verbose else {}
         )
         options = own | ({"settings": {**own.get("settings", {}), **settings}} if settings else {})
-    task = _Task(qp, problem, spec, tol, deadline, max_iter, impulse, options)
-    if initvals is not None:
-        task.initial_x = as_array("initvals", initvals, (len(qp.q),))
+    initial_x = None if initvals is None else as_array("initvals", initvals, (len(qp.q),))
+    task = _SolveTask(
+        qp, problem, tol, deadline, max_iter, impulse, initial_x, spec=spec, options=options
+    )
     return task.solve(begun)
 
 
-@dataclass(eq=False)
-class _Task:
-    """One call of `solve_qp`: its arguments, the best point, and the solvers that ran."""
+@dataclass(eq=False, kw_only=True)
+class _SolveTask(ProgramTask):
+    """One call of `solve_qp`: its solver, with the solutions of the constraint problem."""
 
-    qp: QuadraticProgram
-    given: Problem | None
     spec: SolverSpec
-    tol: float
-    deadline: Deadline
-    max_iter: int | None
-    start: Any
     options: dict[str, Any]
-    initial_x: FloatArray | None = None
-    runs: list[Run] = field(default_factory=list)
-    rays: list[FloatArray] = field(default_factory=list)  # Multipliers of claims of infeasibility.
-    proof: Proof | None = None
-    ray: FloatArray | None = None
     solution: Solution | None = None  # Last solution of the constraint problem.
-
-    def __post_init__(self) -> None:
-        self.start = None if self.start is None else self.problem.make_start(self.start)
-        self.program = get_program(self.qp)
-        self.judge = ProgramJudge(self.program, max(self.tol, MIN_TOL), self.deadline)
-
-    @cached_property
-    def problem(self) -> Problem:
-        """The constraint problem, which a backend does not need."""
-        return Problem(**self.qp.problem_fields(), qp=self.qp) if self.given is None else self.given
 
     def solve(self, begun: float) -> QPSolution:
         """Run the solvers, search for proofs, and build the answer."""
-        rows = self.qp.violated_empty_rows
-        if not len(self.qp.q) or len(rows):  # A row contradicts itself, or x has no entries.
+        if self.start is not None:
+            self.start = self.problem.make_start(self.start)
+        if self.prove_from_empty_row() or not len(self.qp.q):
             self.start = np.zeros(len(self.qp.target) + len(self.qp.q) * self.qp.is_singular)
             self._judge_start()
-            if len(rows):
-                row = rows[np.argmax(np.abs(self.qp.target[rows]))]
-                y = np.zeros(self.problem.m)
-                y[self.problem.m - len(self.qp.target) + row] = np.sign(self.qp.target[row])
-                proof = prove_infeasibility(self.problem, y)
-                # J^T y = 0 and t.y > 0 hold exactly, however small t is beside other rows.
-                self.proof = Proof(y, math.inf) if proof.reason else proof
             return self._make_answer(begun)
-        if (
-            self.spec.delegates and self.deadline.is_set
-        ):  # Later steps would import packages within the limit.
+        if self.spec.delegates and self.deadline.is_set:
+            # Later steps would import packages within the limit.
             begin = perf_counter()
             for backend in program_backends():
                 backend.load()().start_workers(None, 0.0)
             self.deadline.extend(perf_counter() - begin)
         for step in self._list_steps():
             step()
-            if self.judge.error <= self.judge.tol or self.proof is not None:
+            if self.is_over:
                 break
-            if self.runs[-1].status is Status.INTERRUPTED or self.deadline.has_passed():
-                break
-        if self.judge.x is None:  # Without a point, x = 0 is judged.
-            self.judge.keep(np.zeros(len(self.qp.q)), np.zeros(len(self.qp.target)))
-        is_stopped = self.runs[-1].status is Status.INTERRUPTED
-        # Large x makes the violations of rows that contradict each other small: a proof has precedence, also over a
-        # point that was found in `max_iter` iterations.
-        has_budget = self.max_iter is None or self.judge.error <= self.judge.tol
-        has_budget = has_budget and not self.deadline.has_passed() and len(self.qp.q) > 0
-        is_strict = self.judge.strict_error <= self.judge.tol
-        has_doubts = not (is_strict and self.judge.hidden_error <= self.judge.tol)
-        if has_doubts and not is_stopped and has_budget and not self._has_near_solution():
-            # Search for a proof that no x satisfies the rows and, if no point is found, for a ray.
-            self.proof = self.proof or find_infeasibility_proof(
-                self.problem,
-                self.program,
-                self.judge.x,
-                self.judge.tol,
-                self.rays[-1] if self.rays else None,
-                self.deadline,
-                only_small=is_strict,
-            )
-            if self.proof is None and self.qp.is_singular and not is_strict:
-                self._search_ray((RAY_TOLERANCE, RAY_TOLERANCE), self._exact_ray)
-        elif self.qp.is_singular and is_strict and not is_stopped and has_budget:
-            x, lam = self.judge.x, self.judge.lam
-            assert x is not None and lam is not None
-            if self.program.has_hidden_column(x, lam, self.judge.tol):
-                self._search_ray(self._exact_ray)
+        self.prove(self.max_iter is None)
         return self._make_answer(begun)
-
-    @property
-    def _exact_ray(self) -> tuple[float, float]:
-        """Tolerances of a ray beside a point that may be a solution: up to rounding, and a slope above tol."""
-        return EXACT_RAY_TOLERANCE, max(self.judge.tol, EXACT_RAY_TOLERANCE)
-
-    def _search_ray(self, *tolerances: tuple[float, float]) -> None:
-        """Search for a ray and a feasible point."""
-        found = find_ray(self.program, self.judge.x, self.deadline, tolerances)
-        if found is not None:
-            self.ray = mark_read_only(found[0])
-            self.judge.x = found[1]
-            self.judge.lam = np.zeros(len(self.qp.target))
-
-    def _has_near_solution(self) -> bool:
-        """Whether a Newton step from the best point meets tol strictly, so that no proof or ray is to be searched for.
-
-        The step is no part of the answer. It takes a tenth of the time of a linear program.
-        """
-        x, lam = self.judge.x, self.judge.lam
-        if x is None or lam is None or self.rays:
-            return False
-        near = ProgramJudge(self.program, self.judge.tol, self.deadline)
-        near.accepts(x, lam)
-        return max(near.strict_error, near.hidden_error) <= near.tol
 
     def _list_steps(self) -> Iterator[Any]:
         """Yield the runs to do, one after the other, until a point meets tol."""
@@ -305,9 +207,9 @@ class _Task:
                 yield partial(self._run_solve, max(AUTO_TOL_RATIO * self.tol, MIN_TOL), self.start)
             if not self.options:
                 for backend in program_backends():
-                    yield partial(self._call_backend, backend, {})
+                    yield partial(self.call_backend, backend.load()(), self.max_iter)
         elif _is_program_backend(spec, self.options):
-            yield partial(self._call_backend, spec, self.options)
+            yield partial(self.call_backend, spec.load()(**self.options), self.max_iter)
         else:
             yield self._solve_constraint_problem
 
@@ -323,28 +225,6 @@ class _Task:
             status = CONVERGED
             message = "the start is a solution"
         self.runs.append(Run("start", status, message, {}, self.judge.error))
-
-    def _call_backend(self, spec: SolverSpec, options: dict[str, Any]) -> None:
-        """Solve the program by a backend."""
-        solver = spec.load()(**options)
-        assert isinstance(solver, QPSolver)
-        start = None
-        if self.start is not None and solver.backend.starts:
-            start = (
-                self.qp.recover_variables(self.start),
-                self.qp.select_row_multipliers(self.start),
-            )
-            start = start if np.isfinite(start[0]).all() else None
-        elif self.initial_x is not None and solver.backend.starts:
-            start = self.initial_x, np.zeros(len(self.qp.target))
-        judge, result = solver.solve_program(
-            self.qp, self.judge.tol, self.max_iter, self.deadline, start
-        )
-        if judge.error < self.judge.error or self.judge.x is None:
-            self.judge = judge
-        if result.status is INFEASIBLE and result.point is not None:
-            self.rays.append(result.point[1])
-        self.runs.append(Run(spec.name, result.status, result.message, result.work, judge.error))
 
     def _solve_constraint_problem(self) -> None:
         """Solve the constraint problem by the named solver, with smaller tol until the program's error meets tol."""
@@ -386,11 +266,9 @@ class _Task:
     def _make_answer(self, begun: float) -> QPSolution:
         """Build the answer, with the status that the judge confirms."""
         qp, judge = self.qp, self.judge
-        x, lam = judge.x, judge.lam
-        assert x is not None and lam is not None
-        impulse = mark_read_only(np.concatenate([x, lam]) if qp.is_singular else np.array(lam))
+        impulse = mark_read_only(self.impulse)
         y, z, box = qp.multipliers(impulse)
-        last = min(self.runs, key=lambda run: run.error) if len(self.runs) > 1 else self.runs[-1]
+        last = self.best_run
         status = last.status
         conflict = ""
         is_found = judge.error <= self.tol and self.proof is None and self.ray is None
@@ -403,7 +281,7 @@ class _Task:
         elif self.ray is not None:
             status = Status.UNBOUNDED
         elif status in (CONVERGED, INFEASIBLE, Status.ROUNDOFF_LIMIT):
-            is_false = status is CONVERGED and judge.error > get_false_claim_error(self.tol)
+            is_false = is_false_claim(status, judge.error, self.tol)
             if self.solution is not None and self.solution.is_contradicted:
                 conflict = self.solution.status_conflict
             elif is_false and self.spec.external:
@@ -423,7 +301,7 @@ class _Task:
         if conflict:
             solution = solution.with_fields(claim_check=CONTRADICTED)
         return QPSolution(
-            x=mark_read_only(x) if self.proof is None else None,
+            x=None if judge.x is None or self.proof is not None else mark_read_only(judge.x),
             y=y,
             z=z,
             z_box=box,

@@ -28,10 +28,10 @@ from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.base.lazy_import import pandas as pd
-from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem, check_problem
+from lavender.programs.backends import explain_contradicted_claim
 from lavender.report.case_kinds import make_case
 from lavender.report.render import format_cells
 from lavender.report.text import format_residual, format_tolerance

@@ -24,17 +24,16 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, require_packages
 from lavender.base.lazy_import import import_numerical_modules
-from lavender.external.backends import explain_contradicted_claim
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
 from lavender.problem import Problem
+from lavender.programs.backends import explain_contradicted_claim
 from lavender.report import machine
 from lavender.report.case_kinds import ContactCase, ProgramCase, make_case
 from lavender.report.store import ERROR, RUN_COLUMNS, Row
 from lavender.report.text import format_tolerance
 from lavender.solvers import registry
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec, program_backends
 from lavender.solving.limits import make_deadline
-from lavender.solving.singular_programs import program_backends
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = (

@@ -43,13 +43,16 @@ __all__ = [
     "available",
     "get",
     "known",
+    "program_backends",
     "register",
 ]
 
 
 # Modules with the SPECS that are registered first. They are named by strings because they import this module.
-TABLES = ("lavender.solvers", "lavender.external")
+TABLES = ("lavender.solvers", "lavender.programs")
 ENTRY_POINT_GROUP = "lavender.solvers"
+#: Backends that `auto` tries in this order for quadratic programs; osqp is always installed.
+PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 
 
 class SolverOptions(TypedDict, total=False):
@@ -94,7 +97,7 @@ class State(Protocol):
 class Solver:
     """Interface of a solver: `prepare` and `run` are required, the other methods have defaults.
 
-    A plug-in may return any object with `prepare` and `run` (`external/foreign.py` wraps it).
+    A plug-in may return any object with `prepare` and `run` (`solvers/foreign.py` wraps it).
     """
 
     #: Whether the stopping test of a prepared state checks the start, so that no result is worse than the start.
@@ -222,7 +225,7 @@ class SolverSpec:
         Name of the installed package in which lavender found the solver by an entry point; else empty. Solvers with an
         entry point are found by other processes, too.
     builtin : bool
-        Whether the solver is part of this package. The claims of others are checked (`external/foreign.py`).
+        Whether the solver is part of this package. The claims of others are checked (`solvers/foreign.py`).
 
     Raises
     ------
@@ -593,3 +596,8 @@ def available(
         and (law is None or law in table[name].laws)
         and all(getattr(table[name], c) == v for c, v in capabilities.items())
     ]
+
+
+def program_backends() -> list[SolverSpec]:
+    """Return the specs of the installed `PROGRAM_BACKENDS`."""
+    return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]

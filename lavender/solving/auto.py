@@ -30,8 +30,8 @@
     end              a search for a certificate by a linear program, if none was tried before (`certify.py`)
 
 Linear problems given by a matrix, and others with a narrow band as A, start with `direct`. A program with a singular P
-is solved by backends (`singular_programs.py`). The result is the best impulse of all stages. Costs are estimated, never
-measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
+is solved by backends in turn (`lavender/programs`). The result is the best impulse of all stages. Costs are estimated,
+never measured, so the same problem is solved in the same way on every machine. Under a time limit, a factorising solver
 starts only if its estimated cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of
 the time, or all of it if no factorising solver fits. These are `nncg` under Coulomb's law, except on few bodies, and
 else `anderson`. `Solution.stages` lists the stages that ran, `lavender.explain` the stages that would run. The
@@ -43,6 +43,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -55,12 +56,11 @@ from lavender.problem import OPERATORS, Problem
 from lavender.solvers import certify
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS, describe_numbers
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
-from lavender.solvers.registry import Solver, SolverSpec, get
+from lavender.solvers.registry import Solver, SolverSpec, get, program_backends
 from lavender.solvers.small import AUTO, describe_work
 from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
 from lavender.solving.loop import EMPTY_CLAIM, Loop
-from lavender.solving.singular_programs import program_backends, run_program_backends
 from lavender.solving.stages import DecisionTree
 from lavender.solving.steps import Iterations, Sweeps, make_solver, prepare_sweeps
 from lavender_ext.judge.measure import residuals_by_island
@@ -121,7 +121,12 @@ class Auto(Solver):
         """Run as `run`, with a deadline."""
         problem, recorder = state.problem, state.recorder
         if problem.has_singular_program:
-            return run_program_backends(SolveLog(problem, tol, max_iter, deadline), impulse)
+            backend, *others = program_backends()
+            solver: Any = backend.load()()
+            left = deadline.get_remaining_seconds()
+            form = solver.prepare(problem)
+            claim: Claim = solver.run(form, impulse, max_iter, tol, left, tuple(others))
+            return claim
         counts: tuple[int, ...] | None = state.failed_call
         first: FirstSweeps | None = None
         if (

@@ -13,9 +13,8 @@ from lavender.base.deadline import format_seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import get_zero_impulse_reference
 from lavender.problem import Problem, check_problem
-from lavender.solvers.registry import get
+from lavender.solvers.registry import get, program_backends
 from lavender.solvers.small import describe_small_call
-from lavender.solving.singular_programs import program_backends
 from lavender.solving.stages import DecisionTree, Stage
 
 MAX_EXPLAINED_STAGES = (

@@ -655,7 +655,7 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
         ) from error
     if not spec.builtin:
         # Import the adapters of other packages only here, because they take a quarter of the time of `import lavender`.
-        from lavender.external.foreign import ForeignSolver
+        from lavender.solvers.foreign import ForeignSolver
 
         return ForeignSolver(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:

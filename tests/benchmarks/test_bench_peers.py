@@ -31,7 +31,7 @@ def reached(contestant, problem, limit=5.0):
 
 
 def is_adapter(name):
-    """Whether the conversion is of `adapters` itself; those of `lavender.external` have tests of their own."""
+    """Whether the conversion is of `adapters` itself; those of `lavender.programs` have tests of their own."""
     return any(word in name for word in ("own interface", " cones ", "pinocchio", "scipy"))
 
 

@@ -18,11 +18,11 @@ from random_problems import (
 
 import lavender as lv
 from lavender.base import deadline
-from lavender.external.forms import choose_program_form, get_program
-from lavender.external.proofs import find_ray
-from lavender.external.running import Answer, call_backend_until_accepted, classify_status
 from lavender.judge.certificates import check_certificate
 from lavender.problem.cones import project_impulse
+from lavender.programs.forms import choose_program_form, get_program
+from lavender.programs.proofs import find_ray
+from lavender.programs.running import Answer, call_backend_until_accepted, classify_status
 from lavender.solvers import direct
 from lavender.solvers.islands import find_islands
 from lavender.solvers.polyhedral import BoundedRowSolver, convert_to_bounded_rows

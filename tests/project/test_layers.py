@@ -17,7 +17,7 @@ KERNELS = ROOT / "lavender_ext"
 #: Packages of lavender_ext, bottom to top, whose modules share inline headers by cimport.
 LEVELS = (
     {"core"},
-    {"factor", "judge", "local"},
+    {"factor", "judge", "local", "program"},
     {"derivative", "io", "sweep", "velocity_newton"},
     {"newton", "pivot"},
     {"accelerate", "engine"},

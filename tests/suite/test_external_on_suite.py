@@ -6,7 +6,7 @@ from calls import BACKENDS, DEFINITE, installed
 
 import lavender as lv
 from lavender import suite
-from lavender.external import qp_solver
+from lavender.programs import qp_solver
 
 
 @pytest.mark.parametrize("name", BACKENDS)

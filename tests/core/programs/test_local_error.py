@@ -280,7 +280,7 @@ def test_own_solver_searches_no_proof_on_feasible_programs(solver, monkeypatch):
     def fail(*arguments, **options):
         raise AssertionError("a linear program was solved")
 
-    monkeypatch.setattr("lavender.external.proofs._solve_linear_program", fail)
+    monkeypatch.setattr("lavender.programs.proofs._solve_linear_program", fail)
     for seed in range(10):
         rng = np.random.default_rng(seed)
         half, G, inside = (rng.normal(size=size) for size in ((20, 20), (30, 20), 20))
