@@ -52,7 +52,12 @@ from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.problem import PRECISIONS
 from lavender.report.runner import Event
 from lavender.report.text import format_count
-from lavender.report.workers import check_workers, connect_backend, map_unordered
+from lavender.report.workers import (
+    MIN_DURATION_OF_WORKERS,
+    check_workers,
+    connect_backend,
+    map_unordered,
+)
 
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps or fewer.
@@ -64,8 +69,6 @@ DEFAULT_JOINT_WORLDS = (
     8  # Default number of worlds of other engines, and of episodes of environments.
 )
 TIMED_STEPS = 20  # Steps of world 0 that are timed if the number of worlds is given.
-# [s] Steps that take less time are judged in this process: each worker process takes a second to start.
-MIN_DURATION_OF_WORKERS = 2.0
 MAX_CONTACT_STATES = 1000  # Up to about this many states before steps with contact are kept.
 # The states before a world diverges by less than this number of steps are not kept as states with contact: their speeds
 # belong to the divergence, and `slip` simulates settings for 25 steps.
@@ -177,6 +180,7 @@ def audit(
             )
         episodes = DEFAULT_JOINT_WORLDS if worlds is None else worlds
         runs = make_environment_runs(model, episodes, steps, seed)
+        judging = judging.with_forces(runs)
         pieces = _audit_environment(model, policy, runs, judging)
         return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
     if policy is not None:
@@ -220,7 +224,8 @@ def audit(
     if watch is not None:
         watch(Event(0, 0, f"compiling {engine}", ""))
     runs = runs.with_ignored_settings(engine)
-    pieces = _audit_frames(iterate_frames(engine, runs, njmax), judging)
+    judging = judging.with_forces(runs)
+    pieces = _audit_frames(iterate_frames(engine, runs, njmax), judging, runs.model)
     return _collect(Audit.with_size(runs, engine, **common), pieces, judging, watch)
 
 
@@ -301,6 +306,7 @@ def _audit_model(
     if workers == -1 and backend == "loky" and duration * worlds < MIN_DURATION_OF_WORKERS:
         workers = 1
     runs = runs.with_worlds(worlds).choose_spread(spread, watch)
+    judging = judging.with_forces(runs)
     if keep_contact_states:
         share = min(1.0, MAX_CONTACT_STATES / (worlds * runs.steps))
         judging = judging._replace(contact_share=share)
@@ -401,7 +407,7 @@ def judge_states(
 
         assert impulse is not None and batch.contact_counts is not None
         frame = Frame(batch, impulse, {}, batch.row_counts, batch.contact_counts)
-        piece = judge_steps(frame, judging, world[part], step[part], state_of)
+        piece = judge_steps(frame, judging, world[part], step[part], state_of, judge)
         if velocity is not None:
             predicted = Prediction.of_steps(velocity, after[part], world[part], step[part])
             piece = piece._replace(prediction=predicted)
@@ -429,8 +435,8 @@ def _audit_environment(env: Any, policy: Any, runs: Runs, judging: Judging) -> I
                 yield Piece.of_lost_steps(world, rest, lost)
 
 
-def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
-    """Judge the steps of an engine that steps all worlds at once."""
+def _audit_frames(frames: Iterable[Frame], judging: Judging, model: Any = None) -> Iterator[Piece]:
+    """Judge the steps of an engine that steps all worlds at once; `model` as for `judge_steps`."""
     diverged: Any = None
     for k, frame in enumerate(frames):
         n = len(frame.batch)
@@ -444,7 +450,7 @@ def _audit_frames(frames: Iterable[Frame], judging: Judging) -> Iterator[Piece]:
             return {name: x[i] for name, x in state.items()}
 
         judging = judging._replace(precision=frame.batch.precision)
-        piece = judge_steps(frame, judging, np.arange(n), np.full(n, k), state_of)
+        piece = judge_steps(frame, judging, np.arange(n), np.full(n, k), state_of, model)
         lost = (piece.verdict == NOT_JUDGED) & ~diverged
         finite = [all(np.isfinite(x[i]).all() for x in frame.state.values()) for i in range(n)]
         causes = ("state before the step", "forces or acceleration")

@@ -64,6 +64,10 @@ FORCES_NOTE = (
     "Impulse of the engine / time step, beside the exact solution's. The bodies alone determine a force of a contact, "
     "or only the sum of the normal forces between two bodies, or neither."
 )
+PAIR_NOTE = (
+    "Sums over the contacts of two bodies: the engine's, and the difference from the solution's, where the bodies "
+    "determine the sum; the contacts determined are those with a force of their own. All contacts: forces.csv."
+)
 CLASS_COLORS = ("var(--h4)", "var(--h3)", "var(--h1)", "var(--bad)", "var(--ink)")
 ERROR_DEFINITION = (
     "The error of a step is that of its worst row: how far a row's velocity after the step is from one that the row's "
@@ -141,7 +145,8 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
             "A wrong claim hides an error; a missing claim costs iterations.",
         ),
         ("Quantiles of the errors", audit.errors, ""),
-        ("Contact forces of the worst steps", audit.forces, FORCES_NOTE),
+        ("Normal forces of bodies", audit.pair_forces, f"{audit.forces_note} {PAIR_NOTE}"),
+        ("Contact forces of the worst steps", audit.worst_forces, FORCES_NOTE),
         ("Rows and contacts of a step", audit.judged_sizes.table, ""),
         (
             "Worlds that diverged",

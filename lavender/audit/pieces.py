@@ -5,15 +5,27 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.audit.simulated_worlds import Divergence, Frame
+from lavender.audit.bodies import find_bodies
+from lavender.audit.simulated_worlds import Divergence, Frame, Runs
 from lavender.base.arrays import FloatArray
+from lavender.base.lazy_import import pandas as pd
 from lavender.batch.residuals import residual_many
+from lavender.batch.solve import solve_many
+from lavender.diagnostics.forces import (
+    REFERENCE_TOL,
+    ContactForces,
+    is_reference,
+    measure_forces,
+    tabulate_contacts,
+)
 from lavender.io.mujoco import PREDICTION_TOLERANCE
+from lavender.io.mujoco_memory import import_mujoco
 from lavender.judge.residuals import UNCONVERGED, VERDICTS, WRONG
 from lavender.problem import Problem
 
@@ -25,6 +37,8 @@ WORST_ROW_ERRORS = (
     "relative",
     "floor",
 )  # Errors of the worst row [m/s, N s, -, -].
+# About 3 ms a step, so that an audit of a minute takes about 5 s more: each step needs an exact solve and a rank.
+MAX_FORCE_STEPS = 2000
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 # Numbers of contacts differ between steps and are removed from the names of rows.
 CONTACT_NUMBER = re.compile(r"^(contact|limit) \d+\b ?")
@@ -39,6 +53,12 @@ class Judging(NamedTuple):
     keep: int | None = None
     # Up to this fraction of the steps have contact and their state before the step kept.
     contact_share: float = 0.0
+    # Up to this fraction of the steps have contact and their contact forces compared with those of a solution.
+    force_share: float = 0.0
+
+    def with_forces(self, runs: Runs) -> Judging:
+        """Return this judging of runs with contact forces of up to about `MAX_FORCE_STEPS` steps."""
+        return self._replace(force_share=min(1.0, MAX_FORCE_STEPS / (runs.worlds * runs.steps)))
 
 
 class Prediction(NamedTuple):
@@ -115,6 +135,8 @@ class Piece(NamedTuple):
     # digits, and the velocity error of the acceleration [m/s] if the integrator moves the step by the forces, else nan.
     lost_digits: Sequence[tuple[float, float]] = ()
     prediction: Prediction = Prediction()
+    # Contacts of steps with their forces and errors [N] (`tabulate_forces`); None if the time step is not known.
+    forces: pd.DataFrame | None = None
     against: Piece | None = None  # Results of the other model on the same states.
 
     @classmethod
@@ -134,10 +156,12 @@ def judge_steps(
     world: Any,
     step: Any,
     state_of: Callable[[int], dict[str, FloatArray]],
+    model: Any = None,
 ) -> Piece:
     """Judge the engine's answers to the problems of a frame, one for each step.
 
-    `world` and `step` are the numbers of the steps, and `state_of(i)` returns the state before step i.
+    `world` and `step` are the numbers of the steps, and `state_of(i)` returns the state before step i. `model` is the
+    mujoco.MjModel with the time step and the names of the bodies, if there is one.
     """
     batch = frame.batch
     options: Any = {"precision": judging.precision, "threshold": judging.threshold}
@@ -165,8 +189,17 @@ def judge_steps(
         at = float(numbers[0, i]), int(world[i]), int(step[i])
         worst.append(Worst(*at, name, batch[i], impulse, state_of(i)))
     with_contact = np.flatnonzero(contacts > 0)
-    n = min(len(with_contact), int(np.ceil(judging.contact_share * len(world))))
-    chosen = with_contact[np.arange(n) * len(with_contact) // max(n, 1)]
+
+    def choose_evenly(share: float) -> list[int]:
+        """Choose steps with contact, up to this share of all steps."""
+        n = min(len(with_contact), int(np.ceil(share * len(world))))
+        chosen: list[int] = with_contact[np.arange(n) * len(with_contact) // max(n, 1)].tolist()
+        return chosen
+
+    forces = None
+    if model is not None and judging.force_share:
+        steps = choose_evenly(judging.force_share)
+        forces = tabulate_forces(frame, steps, world, step, model)
     return Piece(
         world,
         step,
@@ -179,9 +212,38 @@ def judge_steps(
             (i, CONTACT_NUMBER.sub(r"\1 ", one.worst_label).strip()) for i, one in judged.items()
         ],
         contact_states=[
-            StepState(int(world[i]), int(step[i]), state_of(i)) for i in chosen.tolist()
+            StepState(int(world[i]), int(step[i]), state_of(i))
+            for i in choose_evenly(judging.contact_share)
         ],
         converged=frame.converged,
         n_dropped=frame.n_dropped,
+        forces=forces,
         lost_digits=[(x.lost_digits, x.acceleration_error) for x in r.without_digits.values()],
     )
+
+
+def tabulate_forces(
+    frame: Frame, steps: Sequence[int], world: Any, step: Any, model: Any
+) -> pd.DataFrame:
+    """Return the contacts of some steps of a frame with their forces, as `ContactForces.by_contact`.
+
+    The first columns are `world` and `step`. Steps without an exact solution are left out.
+    """
+    problems = frame.batch[list(steps)]
+    flat = np.asarray(frame.impulse, float).reshape(-1)
+    answers = [flat[frame.batch.rows_of(i)] for i in steps]
+    exact = solve_many(problems, impulses=answers, tol=REFERENCE_TOL, errors="status")
+    pairs = cache(partial(find_bodies, import_mujoco(), model))
+    dt = float(model.opt.timestep)
+    found: list[ContactForces] = []
+    places: list[tuple[int, int]] = []
+    for k, (i, problem, answer) in enumerate(zip(steps, problems, answers, strict=True)):
+        solution = exact[k]
+        if is_reference(solution.residual):
+            forces = measure_forces(problem, answer, solution.impulse, dt, pairs, solution.residual)
+            found.append(forces)
+            places += [(int(world[i]), int(step[i]))] * len(forces.contacts)
+    table = tabulate_contacts(found)
+    table.insert(0, "world", [at for at, _ in places])
+    table.insert(1, "step", [at for _, at in places])
+    return table

@@ -31,7 +31,7 @@ from lavender.audit.simulated_worlds import Divergence, Runs, can_any_geoms_coll
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
-from lavender.diagnostics.forces import contact_forces
+from lavender.diagnostics.forces import CONTACT, ContactForces, contact_forces
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.npz import write_npz
 from lavender.io.stored import prepare_step_folder, write_arrays, write_text
@@ -44,6 +44,10 @@ from lavender.report.text import (
     split_row_unit,
 )
 
+PAIR_HEADS = [
+    "bodies", "steps", "mean force [N]", "median error [N]", "error of 1 % [N]", "largest error [N]",
+    "sum determined", "contacts determined",
+]  # fmt: skip
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 QUANTILE_NAMES = ("50 %", "90 %", "99 %", "99.9 %", "largest error")
 SAVED_KINDS = ("worst", "contact")
@@ -95,6 +99,7 @@ class Audit:
     n_dropped: int = 0  # Number of constraint rows for which the engine had no memory.
     lost_digits: list[tuple[float, float]] = field(default_factory=list)  # See `Piece`.
     prediction: Prediction = field(default_factory=Prediction)
+    step_forces: list[pd.DataFrame] = field(default_factory=list)  # See `Piece.forces`.
     # Causes of the worst steps, then of the step with the largest difference from the rigid laws; of MuJoCo only.
     causes: list[StepCauses] = field(default_factory=list)
     against: Audit | None = None  # Result of another model on the same states.
@@ -157,6 +162,8 @@ class Audit:
         self.n_dropped += piece.n_dropped
         self.lost_digits.extend(piece.lost_digits)
         self.prediction = self.prediction.merge(piece.prediction)
+        if piece.forces is not None and len(piece.forces):
+            self.step_forces.append(piece.forces)
         if self.against is not None and piece.against is not None:
             self.against.add_piece(piece.against, keep)
 
@@ -411,7 +418,7 @@ class Audit:
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
         (worlds, steps)), `verdicts`, `diverged`, rows of (world, step), and of an engine with claims `converged`.
         `states.npz` holds the states before the worst steps, one row each, by the engine's names; for MuJoCo
-        `state` is their mjSTATE_INTEGRATION. `forces.csv` has a row for each contact of the worst steps (`forces`).
+        `state` is their mjSTATE_INTEGRATION. `forces.csv` has a row for each contact of many steps (`forces`).
         """
         folder = self.folder = Path(folder)
         worst = prepare_step_folder(folder / "worst", replace=True)
@@ -432,19 +439,71 @@ class Audit:
         write_text(folder / "forces.csv", self.forces.to_csv(index=False))
 
     @cached_property
-    def forces(self) -> pd.DataFrame:
-        """Contact forces of the worst steps of a model [N], as `lavender.contact_forces`; empty for other engines."""
-        frames = []
+    def _forces_of_worst(self) -> list[tuple[int, Worst, ContactForces]]:
+        """Number, step and contact forces of the worst steps that have a solution; none without a model."""
+        found = []
         for i, w in enumerate(self.worst if self.runs.model is not None else (), 1):
             dt = float(self.runs.model.opt.timestep)
+            pairs = partial(find_bodies, import_mujoco(), self.runs.model)
             with contextlib.suppress(InputError):  # A step without a solution has no exact forces.
-                pairs = partial(find_bodies, import_mujoco(), self.runs.model)
-                table = contact_forces(w.problem, w.impulse, dt=dt, pairs=pairs).table
-                table.insert(0, "file", f"worst_{i}.npz")
-                table.insert(1, "world", w.world)
-                table.insert(2, "step", w.step)
-                frames.append(table)
+                found.append((i, w, contact_forces(w.problem, w.impulse, dt=dt, pairs=pairs)))
+        return found
+
+    @property
+    def worst_forces(self) -> pd.DataFrame:
+        """Contact forces of the worst steps [N], as `lavender.contact_forces`."""
+        frames = []
+        for i, w, forces in self._forces_of_worst:
+            table = forces.table
+            for k, (head, value) in enumerate(
+                {"file": f"worst_{i}.npz", "world": w.world, "step": w.step}.items()
+            ):
+                table.insert(k, head, value)
+            frames.append(table)
         return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
+
+    @cached_property
+    def forces(self) -> pd.DataFrame:
+        """Contacts with their forces and errors [N] of the worst steps and of up to about 2000 others, evenly spaced.
+
+        The columns are `world`, `step` and those of `lavender.ContactForces.by_contact`. Empty without a model.
+        """
+        tables = [*self.step_forces]
+        known = {at for table in tables for at in zip(table["world"], table["step"], strict=True)}
+        for _, w, forces in self._forces_of_worst:
+            if (w.world, w.step) not in known:
+                table = forces.by_contact
+                table.insert(0, "world", w.world)
+                table.insert(1, "step", w.step)
+                tables.append(table)
+        if not tables:
+            return pd.DataFrame()
+        table = pd.concat(tables, ignore_index=True)
+        return table.sort_values(["world", "step"], kind="stable", ignore_index=True)
+
+    @property
+    def pair_forces(self) -> pd.DataFrame:
+        """Normal forces of each pair of bodies and their errors [N] over the steps of `forces`, the largest first."""
+        rows = []
+        for pair, own in self.forces.groupby("bodies", sort=False) if len(self.forces) else ():
+            sums = own.groupby(["world", "step"])[["pair force [N]", "pair error [N]"]].first()
+            known = sums.dropna().to_numpy()
+            sizes = np.full(4, np.nan)
+            if len(known):
+                quantiles = np.quantile(known[:, 1], (0.5, 0.99, 1.0), method="higher")
+                sizes = np.concatenate([[known[:, 0].mean()], quantiles])
+            alone = int((own["determined"] == CONTACT).sum())
+            shares = (len(known), len(sums)), (alone, len(own))
+            rows.append((pair, len(sums), *sizes, *(format_percent(*x) for x in shares)))
+        rows.sort(key=lambda row: -np.nan_to_num(row[2], nan=-1.0))
+        return pd.DataFrame(rows, columns=PAIR_HEADS)
+
+    @property
+    def forces_note(self) -> str:
+        """Sentences on the steps of `forces`."""
+        solved = len(self.forces[["world", "step"]].drop_duplicates()) if len(self.forces) else 0
+        total = int(np.count_nonzero(self.contacts[self.is_judged]))
+        return f"{solved} of {format_count(total, 'step')} with contact compared with an exact solution."
 
     def save_states(self, kind: str, path: str | os.PathLike[str]) -> int:
         """Write states before steps to a file that `--states` reads, and return their number.
@@ -498,6 +557,7 @@ class Audit:
             "provenance": self.provenance,
             "prediction": self.prediction._asdict(),
             "lost_digits": self._count_lost_digits(),
+            "forces": self.pair_forces.to_dict("records"),
         }
         if self.converged is not None:
             totals["claims"] = self.claim_counts
@@ -512,6 +572,7 @@ class Audit:
         rows = [(name, n, format_percent(n, max(counts.n, 1))) for name, n in counts.classes]
         classes = pd.DataFrame(rows, columns=["error of the worst row", "steps", "share"])
         short = [self.comparison, self.claims, classes, self.worst_rows.head(3), self.worst_steps]
+        short.append(self.pair_forces.head(3))
         last = format_provenance(self.provenance)
         return ResultPage(partial(make_audit_page, self), self.totals, short, self.is_stopped, last)
 

@@ -28,6 +28,7 @@ from lavender.base.lazy_import import pandas as pd
 from lavender.causes.comparison import Comparison, compare
 from lavender.causes.difference import Part
 from lavender.causes.problems import record_of_problem
+from lavender.diagnostics.forces import ContactForces
 from lavender.io import mujoco as adapter
 from lavender.io.mujoco_step import step_from_mujoco
 from lavender.io.step_record import ConstraintBlock, StepRecord, get_force
@@ -118,6 +119,7 @@ class SlipExplanation:
     speeds_before: FloatArray | None = None
     # (contacts,): friction force of the engine's answer divided by its limit; nan without a normal force.
     friction_use: FloatArray | None = None
+    knows_surfaces: bool = True  # Whether the velocities of the surfaces are known.
     # Settings that were simulated, if the model is known and this is its state with the fastest contact.
     remedies: tuple[Remedy, ...] = ()
     n_states: int = 0  # Number of states from which the settings were simulated.
@@ -125,6 +127,7 @@ class SlipExplanation:
         ""  # Names of the two bodies with the contacts that are followed in the simulated settings.
     )
     state: int = 0  # Index of the state among the given ones.
+    forces: ContactForces | None = None  # Of all contacts, if the model is known.
 
     def __str__(self) -> str:
         from lavender.report.render import format_cells
@@ -134,14 +137,11 @@ class SlipExplanation:
     @property
     def slips(self) -> pd.DataFrame:
         """Slip of each contact and its parts by cause [m/s, rad/s], and the dominant cause."""
-        columns = {"contact": self.contacts, "points": 1, "speed": self.speeds, **self.parts}
-        slips = _add_dominant_cause(pd.DataFrame(columns))
-        if self.friction_use is not None:
-            # Sliding at the friction limit has a friction force at this limit.
-            unused = np.nan_to_num(self.friction_use, nan=1.0) < MIN_USE_OF_SLIDING
-            is_wrong = unused & (slips["cause"] == CAUSES["rigid"]).to_numpy(bool)
-            slips.loc[is_wrong, "cause"] = UNKNOWN_SURFACE
-        return slips
+        use = np.ones(len(self.contacts))
+        if self.friction_use is not None and not self.knows_surfaces:
+            use = self.friction_use
+        columns = {"contact": self.contacts, "points": 1, "speed": self.speeds, "use": use}
+        return _add_dominant_cause(pd.DataFrame(columns | self.parts))
 
     @property
     def unit(self) -> str:
@@ -357,13 +357,17 @@ def explain_slip(
             and np.array_equal(answer, adapter.impulse(model, data))
         ):
             return explain_record(step_from_mujoco(model, data), contacts)
-    return explain_record(record_of_problem(problem, answer, surface), contacts, has_start=False)
+    record = record_of_problem(problem, answer, surface)
+    return explain_record(record, contacts, has_start=False, knows_surfaces=surface is not None)
 
 
 def explain_record(
-    record: StepRecord, contacts: Any = None, has_start: bool = True
+    record: StepRecord, contacts: Any = None, has_start: bool = True, knows_surfaces: bool = True
 ) -> SlipExplanation:
-    """Explain the slip in a recorded step; `has_start`: its velocity is the one before the step."""
+    """Explain the slip in a recorded step.
+
+    `has_start`: its velocity is the one before the step; `knows_surfaces`: it has the surfaces' velocities.
+    """
     chosen = _choose_blocks(record, contacts)
     names = name_blocks(record)
     found = compare(record)
@@ -395,6 +399,7 @@ def explain_record(
         {cause: np.array(x) for cause, x in intervals.items()}, np.array(rigid), found,
         units=tuple(_find_unit(record, record.blocks[k]) for k in chosen),
         speeds_before=np.array(before) if has_start else None, friction_use=np.array(uses),
+        knows_surfaces=knows_surfaces,
     )  # fmt: skip
 
 
@@ -488,22 +493,27 @@ def _is_dry_friction(block: ConstraintBlock) -> bool:
 
 
 def _add_dominant_cause(slips: pd.DataFrame) -> pd.DataFrame:
-    """Add the largest part of each contact's slip and its cause: `part` [m/s] and `cause`, "no slip" below 1e-6 m/s."""
+    """Add the largest part of each contact's slip and its cause: `part` [m/s] and `cause`, "no slip" below 1e-6 m/s.
+
+    Sliding at the friction limit has a friction force at this limit (`use`, a part of it; nan without a normal force;
+    1 if the surfaces' velocities are known).
+    """
     parts = slips[list(CAUSES.values())]
     slides = slips["speed"] > MIN_EXPLAINED_SLIP
     cause = parts.idxmax(axis=1) if len(slips) else slips["contact"]
-    return slips.assign(
-        cause=cause.where(slides, "no slip"), part=parts.max(axis=1).where(slides, 0.0)
-    )
+    is_unused = (cause == CAUSES["rigid"]) & (slips["use"].fillna(1.0) < MIN_USE_OF_SLIDING)
+    cause = cause.where(slides, "no slip").where(~(slides & is_unused), UNKNOWN_SURFACE)
+    return slips.assign(cause=cause, part=parts.max(axis=1).where(slides, 0.0))
 
 
 def average_slip(explanations: Iterable[SlipExplanation]) -> pd.DataFrame:
-    """Return the slip of each pair of geoms, averaged over its points in several states."""
+    """Return the slip of each pair of geoms, averaged over its points in several states, the fastest pair first."""
     slips = pd.concat([explanation.slips for explanation in explanations])
     groups = slips.drop(columns=["cause", "part"]).groupby(
         slips["contact"].map(get_geoms), sort=False
     )
     means = groups.mean(numeric_only=True).assign(points=groups["points"].sum())
+    means = means.sort_values("speed", ascending=False, kind="stable")
     return _add_dominant_cause(means.reset_index())
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from operator import itemgetter
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.audit.bodies import find_bodies, find_geom, get_geoms
-from lavender.audit.page import ResultPage
+from lavender.audit.page import FORCES_NOTE, ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.settings import MujocoSetting, get_option_value
-from lavender.audit.simulated_worlds import count_engine_warnings, has_diverged
+from lavender.audit.simulated_worlds import Runs, count_engine_warnings, simulate_world
 from lavender.audit.slip import (
     CAUSES,
     MIN_EXPLAINED_SLIP,
@@ -28,15 +32,19 @@ from lavender.audit.slip import (
     tabulate_slip,
 )
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import InputError
+from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import markupsafe
 from lavender.base.lazy_import import pandas as pd
+from lavender.diagnostics.forces import contact_forces, tabulate_contacts
+from lavender.io import mujoco as adapter
+from lavender.io.mujoco import from_mujoco
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.mujoco_step import step_from_mujoco
-from lavender.io.start_states import name_model, read_states, without_sleep
+from lavender.io.start_states import Control, load_model, read_states
 from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
 from lavender.report.text import format_count, format_speed
+from lavender.report.workers import MIN_DURATION_OF_WORKERS, check_workers, map_unordered
 
 MIN_LASTING_SHARE = (
     0.5  # A pair of bodies lasts if it touches in at least this share of the states.
@@ -54,28 +62,86 @@ class SlipOfStates:
     # One for each state that has a contact with friction. The one with the fastest contact has `remedies`: settings of
     # MuJoCo, each simulated from up to 8 states, those in which this contact slides fastest.
     explanations: tuple[SlipExplanation, ...]
-    n_states: int  # Number of states.
+    n_states: int  # Number of worlds, each with the state of its last step.
     # Indices of the states that are left out, because MuJoCo restarts the simulation in a step up to the explained one:
     # its numbers are not finite, or above 1e10.
     diverged: tuple[int, ...] = ()
-    misfit: str = ""  # Sentence on states that do not fit the model; else empty.
+    run_notes: tuple[str, ...] = ()  # Sentences about the worlds and their start states.
     provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
 
     @property
     def worst(self) -> SlipExplanation:
-        """The explanation that has settings, else the one with the fastest contact; there must be at least one."""
-        simulated = (e for e in self.explanations if e.remedies)
-        return next(simulated, max(self.explanations, key=lambda e: e.speeds.max()))
+        """The explanation with the simulated settings, else the one with the fastest point; there must be one."""
+        return next((e for e in self.explanations if e.remedies), self.fastest)
+
+    @property
+    def fastest(self) -> SlipExplanation:
+        """The explanation with the fastest point."""
+        return max(self.explanations, key=lambda e: float(e.speeds.max()))
+
+    @cached_property
+    def slips(self) -> pd.DataFrame:
+        """Slip of each pair of geoms and its parts by cause [m/s], means over points and states, the fastest first."""
+        return average_slip(self.explanations)
 
     @property
     def table(self) -> pd.DataFrame:
         """Mean sliding speed of each pair of geoms [m/s], its largest part and the cause of this part."""
-        return tabulate_slip(average_slip(self.explanations))
+        return tabulate_slip(self.slips)
+
+    @property
+    def verdict(self) -> str:
+        """The fastest pair of geoms with its mean slip and the cause, those of the first row of the table."""
+        first = self.slips.iloc[0]
+        if first["cause"] == "no slip":
+            return f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
+        n = int(first["points"])
+        mean = f" (mean of {format_count(n, 'point')})" if n > 1 else ""
+        return f"{first['contact']}: slips {format_speed(first['speed'])}{mean}; cause: {first['cause']}."
+
+    @property
+    def sentences(self) -> list[str]:
+        """Sentences on the fastest point, with its state, and whether its cause is that of its pair's mean."""
+        fastest = self.fastest
+        lines = fastest.sentences
+        if len(self.explanations) > 1:
+            lines = [f"State {fastest.state} (counted from 0) has the fastest point.", *lines]
+        point = fastest.slips.loc[fastest.slips["speed"].idxmax()]
+        mean = self.slips.set_index("contact").loc[get_geoms(point["contact"])]
+        if point["cause"] != mean["cause"]:
+            lines.append(
+                f"The mean over the points of its two geoms has another cause: {mean['cause']}."
+            )
+        return lines
+
+    @cached_property
+    def forces(self) -> pd.DataFrame:
+        """Contacts of all states with their forces and errors [N]: `state`, then as `ContactForces.by_contact`."""
+        known = [e for e in self.explanations if e.forces is not None]
+        table = tabulate_contacts([e.forces for e in known if e.forces is not None])
+        states = [e.state for e in known if e.forces is not None for _ in e.forces.contacts]
+        table.insert(0, "state", states)
+        return table
+
+    @property
+    def fastest_forces(self) -> pd.DataFrame:
+        """Forces in the state with the fastest point, of the pairs of bodies that have a chosen contact."""
+        fastest = self.fastest
+        if fastest.forces is None:
+            return pd.DataFrame()
+        chosen = {get_geoms(name) for name in fastest.contacts}
+        pairs = {
+            pair
+            for name, pair in zip(fastest.forces.contacts, fastest.forces.pairs, strict=True)
+            if get_geoms(name) in chosen
+        }
+        table = fastest.forces.table
+        return table[table["bodies"].isin(pairs)]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about states that do not fit the model, and that are left out because they diverge."""
-        notes = [self.misfit] if self.misfit else []
+        """Sentences about the worlds, their start states, and those that are left out because they diverge."""
+        notes = [*self.run_notes]
         if n := len(self.diverged):
             left_out = f"{format_count(n, 'state')} of {self.n_states} {'is' if n == 1 else 'are'} left out"
             why = "MuJoCo restarts the simulation, which diverges up to the explained step"
@@ -90,12 +156,13 @@ class SlipOfStates:
         numbers = {
             "states": self.n_states,
             "explained": len(self.explanations),
-            "state": worst.state,
+            "verdict": self.verdict,
             "slip": self.table.to_dict("records"),
             "remedies": remedies,
             "provenance": self.provenance,
         }
-        tables = [self.table, worst.remedies_table] if remedies else [self.table]
+        tables = [self.table, self.fastest_forces]
+        tables += [worst.remedies_table] if remedies else []
         return ResultPage(
             self.make_page, numbers, tables, provenance=format_provenance(self.provenance)
         )
@@ -103,14 +170,7 @@ class SlipOfStates:
     def make_page(self, folder: Path | None) -> Page:
         """Make the page: the fastest contact with its cause, shares of the causes, slip over time, settings."""
         worst = self.worst
-        slips = self.worst.slips
-        first = slips.loc[slips["speed"].idxmax()]
-        verdict = f"No contact slips faster than {format_speed(MIN_EXPLAINED_SLIP)}."
-        if first["cause"] != "no slip":
-            verdict = (
-                f"Contact {first['contact'].removeprefix('contact ')} slips {format_speed(first['speed'])}; "
-                f"cause: {first['cause']}."
-            )
+        first = self.slips.iloc[0]
         blocks: list[Any] = []
         if folder is not None:
             shares = first[list(CAUSES.values())].astype(float).clip(lower=0.0)
@@ -125,10 +185,13 @@ class SlipOfStates:
                 )
                 for i, cause in enumerate(CAUSES.values())
             ]
-            causes = make_shares(parts, title="Causes of this slip")
+            causes = make_shares(parts, title=f"Causes of the slip of {first['contact']}")
             drawn = [markupsafe.Markup(worst.draw_slip(folder))] if worst.remedies else []
             blocks = [{"pair": [drawn or causes, causes if drawn else []]}]
             blocks.append(tabulate_frame(self.table, title="Slip of each pair of geoms"))
+            if len(self.fastest_forces):
+                title = f"Contact forces in state {self.fastest.state}"
+                blocks.append(tabulate_frame(self.fastest_forces, title=title, note=FORCES_NOTE))
             if worst.remedies:
                 blocks.append(tabulate_frame(worst.remedies_table, title="Settings simulated"))
         n = len(self.explanations)
@@ -136,12 +199,14 @@ class SlipOfStates:
         source = f"lavender slip · {model} · {format_count(n, 'state')} with contact"
         head, *settings = worst.advice or [""]
         advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
-        sentences = [" ".join(worst.sentences), *filter(None, [advice])]
-        footer = ["Files: numbers.json, figures/ (PDF, SVG, PNG)."]
+        sentences = [" ".join(self.sentences), *filter(None, [advice])]
+        footer = [
+            "Files: forces.csv (contacts of all states), numbers.json, figures/ (PDF, SVG, PNG)."
+        ]
         return Page(
             "lavender slip",
             source,
-            verdict,
+            self.verdict,
             sentences,
             warnings=self.notes,
             blocks=blocks,
@@ -154,20 +219,31 @@ def explain_slip_of_states(
     states: Any = None,
     *,
     contacts: Sequence[str] | str | None = None,
+    worlds: int | None = None,
     steps: int = 1,
+    control: Control = "hold",
+    seed: int = 0,
+    spread: float | None = None,
+    workers: int = -1,
     watch: Callable[[Event], None] | None = None,
 ) -> SlipOfStates:
-    """Explain the slip of contacts of a MuJoCo model at given states.
+    """Explain the slip of contacts of a MuJoCo model in the last step of worlds.
 
     Parameters
     ----------
-    model : mujoco.MjModel
+    model : path of a model (MJCF, .mjb) or mujoco.MjModel
     states : path of an .npz, "keyframes", or arrays, optional
         As for `lavender.audit`: `states.npz` of an audit or a recording. Default: the model's initial state.
     contacts : names or a part of names, optional
         Geoms of the contacts to explain; default: all. States in which these geoms touch nothing are skipped.
+    worlds : int, optional
+        Worlds that start from the states, as those of `lavender.audit`. Default: one for each state.
     steps : int, default 1
-        Steps that are simulated from each state, with its controls and without sleep; the last one is explained.
+        Steps that are simulated in each world, without sleep; the last one is explained.
+    control, seed, spread
+        As for `lavender.audit`; default: the controls of the state.
+    workers : int
+        Processes; -1: one for each core.
     watch : callable, optional
         Called with the progress.
 
@@ -175,8 +251,13 @@ def explain_slip_of_states(
     -------
     SlipOfStates
     """
-    mj = import_mujoco()
-    model = without_sleep(mj, model)
+    check_workers(workers)
+    mj, loaded = load_model(model)
+    starts = None if states is None else read_states(mj, loaded, states)
+    n = (1 if starts is None else len(starts)) if worlds is None else worlds
+    runs = Runs.of_model(model, n, steps, states=starts, control=control, seed=seed)
+    runs = runs.choose_spread(spread, watch)
+    model = runs.model
     entries = [contacts] if isinstance(contacts, str) else list(contacts or ())
     geoms = [mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, i) or str(i) for i in range(model.ngeom)]
     for entry in entries:
@@ -185,46 +266,46 @@ def explain_slip_of_states(
             raise InputError(
                 f"contacts names {entry!r}, which no geom's name contains; geoms are {known}"
             )
-    starts = None if states is None else read_states(mj, model, states)
-    vectors = [None] if starts is None else list(starts.vectors)
-    misfit = "" if starts is None else starts.misfit
-    explanations: list[SlipExplanation] = []
-    diverged: list[int] = []
-    explained = []  # State vector of each explanation.
+    begin = perf_counter()
+    found = [_explain_world(runs, entries, 0)]
+    if workers == -1 and (perf_counter() - begin) * n < MIN_DURATION_OF_WORKERS:
+        workers = 1
+    tasks = [(runs, entries, world) for world in range(1, n)]
+    for i, result in enumerate(map_unordered(_explain_world, tasks, workers, "loky"), 1):
+        if watch is not None:
+            watch(Event(i, n, "", "", phase="explaining states"))
+        found.append(result)
+    found.sort(key=lambda result: result[0])
+    touching = [(e, state) for _, state, e in found if e is not None and state is not None]
+    explanations = [e for e, _ in touching]
+    diverged = tuple(world for world, state, _ in found if state is None)
+    if explanations:
+        _simulate_remedies(
+            mj, model, explanations, [state for _, state in touching], workers, watch
+        )
+    return SlipOfStates(
+        tuple(explanations), n, diverged, runs.notes, describe_provenance(model, runs.name)
+    )
+
+
+def _explain_world(
+    runs: Runs, entries: list[str], world: int
+) -> tuple[int, FloatArray | None, SlipExplanation | None]:
+    """Explain the last step of a world, in a worker.
+
+    Returns the world, the state before this step (None if the world diverges up to it), and the explanation (None if no
+    chosen contact has friction).
+    """
+    mj = runs.mj
     with count_engine_warnings(mj):
-        for i, vector in enumerate(vectors):
-            if watch is not None:
-                watch(Event(i, len(vectors), "", "", phase="explaining states"))
-            data = _advance(mj, model, vector, steps)
-            if data is None:
-                diverged.append(i)
-                continue
-            explanation = _explain_state(mj, model, data, entries)
-            if explanation is not None:
-                explanations.append(replace(explanation, state=i))
-                own = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
-                mj.mj_getState(model, data, own, mj.mjtState.mjSTATE_INTEGRATION)
-                explained.append(own)
-        if explanations:
-            _simulate_remedies(mj, model, explanations, explained, watch)
-    found = describe_provenance(model, name_model(model))
-    return SlipOfStates(tuple(explanations), len(vectors), tuple(diverged), misfit, found)
-
-
-def _advance(mj: Any, model: Any, vector: FloatArray | None, steps: int) -> Any:
-    """Return data after the forward pass of step number `steps` from a state; None if the simulation diverges."""
-    data = mj.MjData(model)
-    if vector is not None:
-        mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
-    try:
-        for _ in range(steps - 1):
-            mj.mj_step(model, data)
-            if has_diverged(mj, data):
-                return None
-        mj.mj_forward(model, data)
-    except mj.FatalError:
-        return None
-    return None if _is_diverging(mj, data) else data
+        states, divergence, _ = simulate_world(runs, world)
+        if divergence is not None:
+            return world, None, None
+        data = mj.MjData(runs.model)
+        mj.mj_setState(runs.model, data, states[-1], mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_forward(runs.model, data)
+        explanation = _explain_state(runs.model, data, entries)
+    return world, states[-1], None if explanation is None else replace(explanation, state=world)
 
 
 def _is_diverging(mj: Any, data: Any) -> bool:
@@ -234,7 +315,7 @@ def _is_diverging(mj: Any, data: Any) -> bool:
     )
 
 
-def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
+def _explain_state(model: Any, data: Any, entries: list[str]) -> SlipExplanation | None:
     """Explain the step after a forward pass; None if no chosen contact has friction."""
     record = step_from_mujoco(model, data)
     names = [
@@ -245,11 +326,22 @@ def _explain_state(mj: Any, model: Any, data: Any, entries: list[str]) -> SlipEx
     touching = [entry for entry in entries if any(entry in name for name in names)]
     if not names or (entries and not touching):
         return None
-    return explain_record(record, touching or None)
+    forces = None
+    # A step without a solution, or whose integrator hides its matrix, has no exact forces.
+    with contextlib.suppress(InputError, CapabilityError):
+        pairs = partial(find_bodies, import_mujoco(), model)
+        answer = adapter.impulse(model, data), float(model.opt.timestep)
+        forces = contact_forces(from_mujoco(model, data), answer[0], dt=answer[1], pairs=pairs)
+    return replace(explain_record(record, touching or None), forces=forces)
 
 
 def _simulate_remedies(
-    mj: Any, model: Any, explanations: list[SlipExplanation], starts: list[FloatArray], watch: Any
+    mj: Any,
+    model: Any,
+    explanations: list[SlipExplanation],
+    starts: list[FloatArray],
+    workers: int,
+    watch: Any,
 ) -> None:
     """Simulate settings from the states in which the followed pair slides fastest, and add their results.
 
@@ -274,14 +366,14 @@ def _simulate_remedies(
         if watch is not None:
             states = format_count(len(chosen), "state")
             watch(Event(k, len(settings), states, "", phase="simulating settings"))
-        results = [_simulate_slip(mj, changed, state, pair) for state in chosen]
-        steps = [step for _, step in results]
-        if k == 0 and min(steps) < 0:
+        tasks = [(changed, state, pair, i) for i, state in enumerate(chosen)]
+        found = sorted(map_unordered(_simulate_slip, tasks, workers, "loky"), key=itemgetter(0))
+        results = [(speeds, step) for _, speeds, step in found]
+        if k == 0 and min(step for _, step in results) < 0:
             # Compare settings only from the states from which the present setting does not diverge.
-            chosen = [state for state, step in zip(chosen, steps, strict=True) if step < 0]
+            chosen = [chosen[i] for i, _, step in found if step < 0]
             results = [result for result in results if result[1] < 0]
-            steps = [-1]
-        step = min((step for step in steps if step >= 0), default=-1)
+        step = min((step for _, step in results if step >= 0), default=-1)
         remedies.append(Remedy.of_runs(text, np.array([speeds for speeds, _ in results]), step))
     explanations[fastest] = replace(
         explanations[fastest], remedies=tuple(remedies), n_states=len(chosen), followed=pair
@@ -329,30 +421,35 @@ def _change_settings(
         yield f'friction="{friction:g}" of {" and ".join(names)}', changed
 
 
-def _simulate_slip(mj: Any, model: Any, state: FloatArray, pair: str) -> tuple[FloatArray, int]:
-    """Return the sliding speeds of two bodies (1 + REMEDY_STEPS,) [m/s] in the steps from a state.
+def _simulate_slip(
+    model: Any, state: FloatArray, pair: str, number: int
+) -> tuple[int, FloatArray, int]:
+    """Simulate the steps from a state, in a worker.
 
-    A speed is nan if no geoms of the two bodies touch in this step. The second result is the step in which the
-    simulation diverges (0 is the first), from which on all speeds are nan, or -1.
+    Returns the state's number, the sliding speeds of two bodies (1 + REMEDY_STEPS,) [m/s], nan in a step in which no
+    geoms of the two touch, and the step in which the simulation diverges (0 is the first), from which on all speeds are
+    nan, or -1.
     """
+    mj = import_mujoco()
     data = mj.MjData(model)
     means = np.full(REMEDY_STEPS + 1, np.nan)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    for step in range(REMEDY_STEPS + 1):
-        try:
-            mj.mj_forward(model, data)
-            if _is_diverging(mj, data):
-                return means, step
-            record = step_from_mujoco(model, data)
-            mj.mj_step(model, data)
-        except mj.FatalError:
-            return means, step
-        names = name_blocks(record)
-        sliding = [
-            read_slip(block) for name, block in zip(names, record.blocks, strict=True)
-            if block.has_friction and find_bodies(mj, model, name) == pair
-        ]  # fmt: skip
-        speeds = [np.linalg.norm(rows @ data.qvel - surface) for rows, surface in sliding]
-        if speeds:
-            means[step] = np.mean(speeds)
-    return means, -1
+    with count_engine_warnings(mj):
+        for step in range(REMEDY_STEPS + 1):
+            try:
+                mj.mj_forward(model, data)
+                if _is_diverging(mj, data):
+                    return number, means, step
+                record = step_from_mujoco(model, data)
+                mj.mj_step(model, data)
+            except mj.FatalError:
+                return number, means, step
+            sliding = [
+                read_slip(block)
+                for name, block in zip(name_blocks(record), record.blocks, strict=True)
+                if block.has_friction and find_bodies(mj, model, name) == pair
+            ]
+            speeds = [np.linalg.norm(rows @ data.qvel - surface) for rows, surface in sliding]
+            if speeds:
+                means[step] = np.mean(speeds)
+    return number, means, -1

@@ -24,6 +24,7 @@ from lavender.cli.options import (
     quiet_option,
     reject_options_without_effect,
     threshold_option,
+    workers_option,
 )
 from lavender.io.stored import check_writable
 
@@ -67,9 +68,7 @@ from lavender.io.stored import check_writable
     metavar="N",
     help="Rows of a world for mujoco_warp, as in your simulation; default: as many as needed.",
 )
-@click.option(
-    "--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core."
-)
+@workers_option
 @click.option(
     "--backend", default="loky", show_default=True, help="A backend of joblib, such as dask."
 )

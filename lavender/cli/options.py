@@ -134,17 +134,23 @@ def add_options(
 
 
 def add_worlds_options(
-    worlds: int | None, steps: int
+    worlds: int | None,
+    steps: int,
+    control: str = "random",
+    default_worlds: str = "as many as take about a minute",
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
+    """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults.
+
+    `default_worlds` says how many worlds there are if `worlds` is None.
+    """
     options: list[Option] = [
         (
             ("--worlds",),
             {
                 "default": worlds,
                 "type": int,
-                "help": "Number of worlds; the first is the one of `lavender "
-                "record`." + " Default: as many as take about a minute." * (worlds is None),
+                "help": "Number of worlds; the first is the one of `lavender record`."
+                + f" Default: {default_worlds}." * (worlds is None),
             },
         ),
         (("--steps",), {"default": steps, "help": "Steps of each world."}),
@@ -159,11 +165,10 @@ def add_worlds_options(
             },
         ),
     ]
-    options += [
-        (names, more)
-        for names, more in RECORDING_OPTIONS
-        if names[0] in ("--controls", "--seed", "--states")
-    ]
+    for names, more in RECORDING_OPTIONS:
+        if names[0] in ("--controls", "--seed", "--states"):
+            own = {"default": control} if names[0] == "--controls" else {}
+            options.append((names, more | own))
     return add_options(options, show_default=True)
 
 
@@ -210,6 +215,10 @@ limit_option = add_options([LIMIT])
 #: Option of the commands that write a page.
 quiet_option = click.option(
     "-q", "--quiet", is_flag=True, help="Print only the path of the page, and errors."
+)
+#: Option of the commands that simulate worlds in processes.
+workers_option = click.option(
+    "--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core."
 )
 #: Options of all commands that simulate and record a MuJoCo model.
 RECORDING_OPTIONS: tuple[Option, ...] = (

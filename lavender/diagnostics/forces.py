@@ -4,10 +4,9 @@
     forces.table                                                    # a row for each contact, in N
 
 If A is singular, contact forces are not unique: of a table on four feet, only the sum is. With the null vectors y of
-J^T (J^T y = 0; of A if only A is known), every solution is lambda + y, so that
-
-    a contact's force is determined if y is zero on its rows                          (`lavender.redundancy`)
-    a pair's normal force, sum lambda_n / dt over its contacts, if sum y_n = 0 for all y
+J^T (J^T y = 0; of A if only A is known), every solution is lambda + y. A sum of normal forces, of one contact or of all
+contacts between two bodies, is *determined* if no y that is as large as the largest normal force of its island changes
+it by more than 1 %. A friction force is determined if no such y changes it by more than 1 % of its normal force.
 
 Compliance does not count: the softness of an engine divides a load among four feet, but no property of the bodies does.
 These hold for symmetric A without Coulomb friction. Under Coulomb's law, other solutions with other sliding contacts
@@ -26,7 +25,7 @@ from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
 from lavender.base.lazy_import import sparse as sp
-from lavender.diagnostics.redundancy import redundancy
+from lavender.diagnostics.redundancy import MIN_NEW_PART, redundancy
 from lavender.judge.residuals import Residual, residual
 from lavender.judge.solution import raise_if_interrupted
 from lavender.problem import Problem, check_problem
@@ -35,11 +34,18 @@ from lavender.solvers.islands import find_islands, get_rows_of_blocks
 from lavender.solving.solve import solve
 
 REFERENCE_TOL = 1e-10  # [-] Relative residual of the reference solve.
+# Islands of up to this many rows are decomposed at once; larger ones if `redundancy` finds dependent rows.
+MAX_DIRECT_ROWS = 200
 MAX_NULL_ROWS = (
     2000  # Above this number of dependent rows in an island, no sum of a pair is tested.
 )
 NULL_ENTRY = 1e-8  # [-] A sum of a null vector of length 1 up to this counts as zero.
+DETERMINED_TO = 0.01  # [-] A force is determined if it cannot change by more than this part of it.
 CONTACT, PAIR, UNDETERMINED = "contact", "pair", "not determined"
+HEADS = (
+    "contact", "bodies", "normal force [N]", "friction force [N]", "exact normal force [N]", "error [N]",
+    "share of the load [%]", "determined", "pair force [N]", "pair error [N]",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,16 +59,17 @@ class ContactForces:
     pairs : tuple of str
         Names of the two bodies of each contact.
     normal, tangential : (c,) N
-        Normal force and norm of the friction force of the given impulse.
+        Normal force and norm of the friction force of the given impulse; the latter is nan for a pyramid, and if it is
+        not determined.
     exact : (c,) N
         Normal force of the reference.
     error : (c,) N
-        Norm of the difference of both forces, over the rows of normal and tangents.
+        Norm of the difference of both forces, over the normal row, and the tangents where friction is determined.
     share : (c,)
         Part of its pair's exact normal force that a contact bears [-]; nan if the contact's force is not determined.
     determined : tuple of str
-        "contact" if the force of the contact is determined, "pair" if only the sum of the pair's normal forces is, else
-        "not determined".
+        "contact" if the normal force of the contact is determined, "pair" if only the sum of the pair's normal forces
+        is, else "not determined".
     dt : float, s
     reference_residual : Residual
     """
@@ -109,12 +116,41 @@ class ContactForces:
                 rows.append((name, pair, first, np.nan, exact, abs(first - exact), 100.0, kind))
             else:
                 rows.append((name, pair, np.nan, np.nan, np.nan, np.nan, np.nan, kind))
-        heads = ["contact", "bodies", "normal force [N]", "friction force [N]"]
-        heads += ["exact normal force [N]", "error [N]", "share of the load [%]", "determined"]
-        return pd.DataFrame(rows, columns=heads)
+        return pd.DataFrame(rows, columns=HEADS[:8])
+
+    @property
+    def by_contact(self) -> pd.DataFrame:
+        """A row for each contact, also for those whose force is not determined alone.
+
+        The columns are those of `table`, `pair force [N]`, the sum of the normal forces of the contact's two bodies,
+        and `pair error [N]`; what is not determined is nan, but `normal force [N]`, which is the engine's.
+        """
+        return tabulate_contacts([self])
 
     def __str__(self) -> str:
         return self.table.to_string(index=False, float_format="{:.3g}".format, na_rep="–")
+
+
+def tabulate_contacts(steps: Sequence[ContactForces]) -> pd.DataFrame:
+    """Return the rows of `ContactForces.by_contact` of several steps."""
+    parts: list[list[Any]] = [[] for _ in HEADS]
+    for forces in steps:
+        if not forces.contacts:
+            continue
+        pairs, place = np.unique(np.array(forces.pairs, object), return_inverse=True)
+        kinds = np.array(forces.determined, object)
+        is_alone = kinds == CONTACT
+        sums = np.bincount(place, forces.normal, len(pairs))
+        exact = np.bincount(place, forces.exact, len(pairs))
+        sums[place[kinds == UNDETERMINED]] = np.nan
+        columns = (
+            forces.contacts, forces.pairs, forces.normal, forces.tangential,
+            np.where(is_alone, forces.exact, np.nan), np.where(is_alone, forces.error, np.nan),
+            100.0 * forces.share, kinds, sums[place], np.abs(sums - exact)[place],
+        )  # fmt: skip
+        for part, column in zip(parts, columns, strict=True):
+            part.extend(column)
+    return pd.DataFrame(dict(zip(HEADS, parts, strict=True)))
 
 
 def contact_forces(
@@ -157,11 +193,28 @@ def contact_forces(
         reference = raise_if_interrupted(solve(problem, impulse=own, tol=REFERENCE_TOL)).impulse
     exact = problem.make_start(reference, "reference")
     judged = residual(problem, exact)
-    if not (judged.relative <= 1e3 * REFERENCE_TOL or judged.at_floor):
+    if not is_reference(judged):
         raise InputError(
             f"reference has a relative residual of {judged.relative:.1e}; {1e3 * REFERENCE_TOL:.0e}, or its floor, is "
             "needed: forces of a step without a solution have no error"
         )
+    return measure_forces(problem, own, exact, dt, pairs, judged)
+
+
+def is_reference(judged: Residual) -> bool:
+    """Return whether a solution is exact enough for forces to be compared with it."""
+    return bool(judged.relative <= 1e3 * REFERENCE_TOL or judged.at_floor)
+
+
+def measure_forces(
+    problem: Problem,
+    own: FloatArray,
+    exact: FloatArray,
+    dt: float,
+    pairs: Sequence[str] | Callable[[str], str] | None,
+    judged: Residual,
+) -> ContactForces:
+    """Return the forces of an impulse [N s] beside those of a solution, whose residual is `judged`."""
     found = _list_contacts(problem)
     if callable(pairs):
         pairs = [pairs(contact.name) for contact in found]
@@ -179,13 +232,11 @@ def contact_forces(
         return np.array([x[contact.normals].sum() for contact in found]) / dt, friction / dt
 
     (normal, friction), (correct, wanted) = measure(own), measure(exact)
+    determined, has_friction = _find_determined(problem, found, names, exact)
     with np.errstate(over="ignore"):  # Of impulses beyond 1e154 N s.
-        error = np.hypot(normal - correct, np.linalg.norm(friction - wanted, axis=1))
-        size = np.linalg.norm(friction, axis=1)
-    tangential = np.array(
-        [np.nan if len(contact.normals) > 1 else x for contact, x in zip(found, size, strict=True)]
-    )
-    determined = _find_determined(problem, found, names)
+        gap = np.where(has_friction, np.linalg.norm(friction - wanted, axis=1), 0.0)
+        error = np.hypot(normal - correct, gap)
+        size = np.where(has_friction, np.linalg.norm(friction, axis=1), np.nan)
     loads: dict[str, float] = {}
     for name, force in zip(names, correct, strict=True):
         loads[name] = loads.get(name, 0.0) + float(force)
@@ -197,7 +248,7 @@ def contact_forces(
     )
     contacts = tuple(contact.name for contact in found)
     return ContactForces(
-        contacts, tuple(names), normal, tangential, correct, error, share, determined, dt, judged
+        contacts, tuple(names), normal, size, correct, error, share, determined, dt, judged
     )  # fmt: skip
 
 
@@ -211,7 +262,7 @@ class _Contact(NamedTuple):
 
 
 def _list_contacts(problem: Problem) -> list[_Contact]:
-    """Return the contacts of a problem; rows "NAME, edge K" are one contact NAME with a pyramid."""
+    """Return the contacts of a problem; rows "NAME, edge K" from edge 0 on are one contact NAME with a pyramid."""
     cones, rows = problem.cones, problem.rows
     contacts: list[_Contact] = []
     pyramids: dict[str, _Contact] = {}
@@ -219,10 +270,10 @@ def _list_contacts(problem: Problem) -> list[_Contact]:
     for k in range(problem.n_blocks):
         name, first = problem.block_name(k), int(cones.ptr[k])
         if not cones.is_contact[k]:
-            name, edge, _ = name.partition(", edge ")
+            name, edge, number = name.partition(", edge ")
             if not edge:
                 continue
-            if name not in pyramids:
+            if name not in pyramids or number == "0":
                 pyramids[name] = _Contact(name, _name_pair(name), [], [])
                 contacts.append(pyramids[name])
             pyramids[name].normals.extend(range(first, int(cones.ptr[k + 1])))
@@ -241,58 +292,76 @@ def _name_pair(contact: str) -> str:
 
 
 def _find_determined(
-    problem: Problem, contacts: Sequence[_Contact], names: Sequence[str]
-) -> tuple[str, ...]:
-    """Return what the rigid rows determine of each contact: its force, the sum of its pair, or nothing."""
+    problem: Problem, contacts: Sequence[_Contact], names: Sequence[str], exact: FloatArray
+) -> tuple[tuple[str, ...], Any]:
+    """Return what the rigid rows determine of each contact with these forces [N s], and whether its friction, too."""
     if problem.compliance is not None and problem.compliance.any():
         problem = replace(problem, compliance=np.zeros(problem.m))
-    found = redundancy(problem)
-    unique = found.impulse_is_unique
-    sums = {name: np.zeros(problem.m) for name in names}
-    for name, contact in zip(names, contacts, strict=True):
-        sums[name][contact.normals] = 1.0
-    is_known = dict.fromkeys(names, True)
-    whole = [bool(unique[[*c.normals, *c.tangents]].all()) for c in contacts]
-    pyramids = {k: True for k, c in enumerate(contacts) if len(c.normals) > 1 and not whole[k]}
-    for island in [] if unique.all() else group_blocks_by_island(*find_islands(problem)):
-        rows = get_rows_of_blocks(problem, island)
-        if unique[rows].all():
+    labels = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    # The contact and the pair of bodies of each normal row, -1 for other rows.
+    contact_of, pair_of = np.full((2, problem.m), -1)
+    is_contact = np.zeros(problem.m, bool)
+    for k, contact in enumerate(contacts):
+        contact_of[contact.normals], pair_of[contact.normals] = k, labels[names[k]]
+        is_contact[[*contact.normals, *contact.tangents]] = True
+    is_alone, has_sum = np.ones(len(contacts), bool), np.ones(len(labels), bool)
+    has_friction = np.array([len(contact.normals) == 1 for contact in contacts], bool)
+    loads = np.array([exact[contact.normals].sum() for contact in contacts])
+    islands = [
+        get_rows_of_blocks(problem, x) for x in group_blocks_by_island(*find_islands(problem))
+    ]
+    unique = np.zeros(problem.m, bool)
+    if max(map(len, islands), default=0) > MAX_DIRECT_ROWS:
+        unique = redundancy(problem).impulse_is_unique
+    for rows in islands:
+        if unique[rows].all() or not is_contact[rows].any():
             continue
-        vectors = _compute_null_vectors(problem, rows, found.tol)
-        place = {int(row): i for i, row in enumerate(rows)}
-        for name, total in sums.items():
-            if total[rows].any() and not _is_zero_for_all(vectors, total[rows]):
-                is_known[name] = False
-        for k in pyramids:
-            if contacts[k].normals[0] in place:
-                part = np.isin(rows, contacts[k].normals).astype(float)
-                pyramids[k] = _is_zero_for_all(vectors, part)
-    return tuple(
-        CONTACT if whole[k] or pyramids.get(k, False) else PAIR if is_known[name] else UNDETERMINED
-        for k, name in enumerate(names)
-    )
+        vectors = _compute_null_vectors(problem, rows, is_contact[rows])
+        if vectors is None:
+            vectors = np.where(unique[rows] | ~is_contact[rows], 0.0, 1.0)[None]
+        inside = np.unique(contact_of[rows][contact_of[rows] >= 0])
+        scale = float(loads[inside].max(initial=0.0)) or 1.0
+        for is_known, group in ((is_alone, contact_of[rows]), (has_sum, pair_of[rows])):
+            entries, place = np.unique(group, return_inverse=True)
+            sums = np.linalg.norm(vectors @ np.eye(len(entries))[place], axis=0)
+            total = np.bincount(place, np.maximum(exact[rows], 0.0), len(entries))
+            is_lost = scale * sums > np.maximum(NULL_ENTRY * scale, DETERMINED_TO * total)
+            is_known[entries[is_lost & (entries >= 0)]] = False
+        at = {int(row): i for i, row in enumerate(rows)}
+        for k in inside.tolist():
+            own = [at[row] for row in contacts[k].tangents]
+            change = scale * float(np.linalg.norm(vectors[:, own]))
+            if change > max(NULL_ENTRY * scale, DETERMINED_TO * loads[k]):
+                has_friction[k] = False
+    kinds = [
+        CONTACT if is_alone[k] else PAIR if has_sum[labels[names[k]]] else UNDETERMINED
+        for k in range(len(contacts))
+    ]
+    return tuple(kinds), has_friction & is_alone
 
 
-def _is_zero_for_all(vectors: FloatArray | None, part: FloatArray) -> bool:
-    """Return whether a sum of entries is zero for all null vectors; False if these are not known."""
-    return vectors is not None and bool(np.abs(vectors @ part).max(initial=0.0) <= NULL_ENTRY)
+def _compute_null_vectors(problem: Problem, rows: Any, kept: Any) -> FloatArray | None:
+    """Return vectors y (any, rows) that move nothing in an island, orthonormal on the rows `kept` and 0 elsewhere.
 
-
-def _compute_null_vectors(problem: Problem, rows: Any, tol: float) -> FloatArray | None:
-    """Return the vectors y (any, rows) of length 1 that move nothing in an island; None if it is too large."""
+    None if it is too large, or if A is not symmetric and singular.
+    """
     if len(rows) > MAX_NULL_ROWS:
         return None
+    tol = MIN_NEW_PART if problem.matrix is not None or problem.precision == "float32" else 1e-12
     if problem.matrix is None:
         # The columns of bodies that cannot move have to be zero.
         whole = problem.jacobian if problem.rows is None else problem.velocity_form().jacobian
-        part = sp.csr_array(whole)[rows]
-        part = part[:, np.unique(part.indices)].toarray()
+        part = sp.csr_array(whole)[rows].toarray()
+        part = part[:, part.any(axis=0)]
     else:
         part = problem.csr[rows][:, rows].toarray()
     scale = np.linalg.norm(part, axis=1)
     scale = np.where(scale > 0.0, scale, 1.0)
     left, size, _ = np.linalg.svd(part / scale[:, None])
-    kept = np.concatenate([size, np.zeros(len(rows) - len(size))])
-    limit = max(tol, len(rows) * 2.0**-50) * kept.max(initial=1.0)
-    vectors = left[:, kept <= limit].T / scale
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    sizes = np.concatenate([size, np.zeros(len(rows) - len(size))])
+    limit = max(tol, len(rows) * 2.0**-50) * sizes.max(initial=1.0)
+    vectors = left[:, sizes <= limit].T / scale
+    if len(vectors) and not problem.is_symmetric:
+        return None
+    _, size, right = np.linalg.svd(vectors * kept, full_matrices=False)
+    return np.asarray(right[size > NULL_ENTRY * size.max(initial=1.0)])

@@ -10,6 +10,8 @@ from typing import Any
 
 from lavender.base.errors import InputError, require_packages
 
+# [s] Steps that take less time are judged in this process: each worker process takes a second to start.
+MIN_DURATION_OF_WORKERS = 2.0
 MAX_WORKERS = 4096  # [processes] More than any machine has cores.
 CONNECT_TIMEOUT = 10.0  # [s] Time for a scheduler to answer.
 

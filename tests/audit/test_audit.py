@@ -20,7 +20,7 @@ from lavender.audit.audit import audit
 from lavender.audit.page import AuditCounts
 from lavender.audit.pieces import AUDIT_VERDICTS
 from lavender.audit.result import Audit
-from lavender.audit.simulated_worlds import Frame, Runs, iterate_frames
+from lavender.audit.simulated_worlds import Frame, Runs, iterate_frames, simulate_world
 from lavender.io.efc import from_efc
 
 
@@ -480,21 +480,46 @@ def test_audit_prints_the_next_command_as_it_can_be_pasted(tmp_path, monkeypatch
     assert not own.page.make_page(None).code
 
 
-def test_audit_writes_the_contact_forces_of_its_worst_steps(boxes, tmp_path):
-    found = audit(boxes(EARLY), worlds=2, steps=20, workers=1)
-    found.write(tmp_path)
-    table = pd.read_csv(tmp_path / "forces.csv")
-    assert len(table) and set(table["file"]) <= {
-        f"worst_{i + 1}.npz" for i in range(len(found.worst))
-    }
-    first = table[table["file"] == "worst_1.npz"]
-    worst = found.worst[0]
-    forces = lv.contact_forces(worst.problem, worst.impulse, dt=found.runs.model.opt.timestep)
-    total = first["normal force [N]"].sum()
-    known = [
-        f
-        for f, kind in zip(forces.normal, forces.determined, strict=True)
-        if kind != "not determined"
-    ]
-    np.testing.assert_allclose(total, np.sum(known), rtol=1e-9)
-    assert "Contact forces of the worst steps" in found.page.write(tmp_path / "page").read_text()
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_audit_writes_the_contact_forces_of_its_steps(cone, tmp_path):
+    """The forces are those of mj_contactForce, the exact ones those of a converged solver in the same state."""
+    path = tmp_path / "tripod.xml"
+    path.write_text(f"""<mujoco><option solver="CG" iterations="2" cone="{cone}" timestep="0.004"/><worldbody>
+      <geom name="floor" type="plane" size="0 0 1"/><body name="stool" pos="0 0 .5"><freejoint/>
+      <geom type="box" size=".3 .3 .02" mass="3"/><geom name="a" type="sphere" size=".05" pos=".3 0 -.45"/>
+      <geom name="b" type="sphere" size=".05" pos="-.2 .3 -.45"/>
+      <geom name="c" type="sphere" size=".05" pos="-.2 -.3 -.45"/></body></worldbody></mujoco>""")
+    found = audit(path, worlds=2, steps=30, spread=0.01, workers=1, keep=2)
+    found.write(tmp_path / "out")
+    table = pd.read_csv(tmp_path / "out" / "forces.csv")
+    model = mj.MjModel.from_xml_path(str(path))
+    exact = mj.MjModel.from_xml_path(str(path))
+    exact.opt.solver, exact.opt.iterations, exact.opt.tolerance = 2, 1000, 0.0  # Newton
+    for world in range(2):
+        states, _, _ = simulate_world(found.runs, world)
+        for step, state in enumerate(states):
+            own = table[(table["world"] == world) & (table["step"] == step)]
+            forces = []
+            for solver in (model, exact):
+                data = mj.MjData(solver)
+                mj.mj_setState(solver, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+                mj.mj_forward(solver, data)
+                force = np.zeros((data.ncon, 6))
+                for k in range(data.ncon):
+                    mj.mj_contactForce(solver, data, k, force[k])
+                forces.append(force[:, 0])
+            np.testing.assert_allclose(own["normal force [N]"], forces[0], rtol=1e-9, atol=1e-9)
+            if data.ncon == 3:  # Three feet determine their normal forces, and not their friction.
+                assert set(own["determined"]) == {"contact"}
+                assert set(own["bodies"]) == {"stool and world"}
+                np.testing.assert_allclose(own["exact normal force [N]"], forces[1], rtol=1e-5)
+                gap = np.abs(forces[0] - forces[1])
+                np.testing.assert_allclose(own["error [N]"], gap, rtol=1e-4, atol=1e-4)
+                total = np.full(3, abs(forces[0].sum() - forces[1].sum()))
+                np.testing.assert_allclose(own["pair error [N]"], total, rtol=1e-4, atol=1e-4)
+    steps = int((found.contacts > 0).sum())
+    assert found.forces_note.startswith(f"{steps} of {steps} steps")
+    text = found.page.write(tmp_path / "page").read_text()
+    assert "Normal forces of bodies" in text and "Contact forces of the worst steps" in text
+    pair = found.pair_forces.set_index("bodies").loc["stool and world"]
+    assert pair["largest error [N]"] == table["pair error [N]"].max()

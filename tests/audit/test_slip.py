@@ -345,6 +345,63 @@ def test_slip_over_time_counts_steps_with_contact_of_all_states():
     assert both.remedies_table.iloc[0].tolist()[3:] == [f"{n} of 50", f"{now.kept} of 2"]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_slip_headline_has_the_pair_and_the_cause_of_the_largest_mean(seed):
+    """Boxes in a heap, with few iterations: the means over points and states are taken here."""
+    rng = np.random.default_rng(seed)
+    boxes = "".join(
+        f"""<body pos="{x:.3f} {y:.3f} {0.1 + 0.2 * i:.3f}"><freejoint/><geom name="box{i}" type="box"
+        size=".1 .1 .1" friction="{mu:.2f}"/></body>"""
+        for i, (x, y, mu) in enumerate(rng.uniform([-0.05, -0.05, 0.1], [0.05, 0.05, 0.9], (3, 3)))
+    )
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option iterations="{rng.integers(1, 9)}" gravity="1 0 -9"
+      cone="{["elliptic", "pyramidal"][seed % 2]}"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>{boxes}
+      </worldbody></mujoco>""")
+    result = explain_slip_of_states(
+        model, worlds=3, steps=int(rng.integers(20, 80)), spread=0.05, workers=1
+    )
+    points = [
+        (contact.split("(")[1].rstrip(")"), speed, {c: x[k] for c, x in e.parts.items()})
+        for e in result.explanations
+        for k, (contact, speed) in enumerate(zip(e.contacts, e.speeds, strict=True))
+    ]
+    pairs = sorted({pair for pair, _, _ in points})
+    means = {p: np.mean([speed for pair, speed, _ in points if pair == p]) for p in pairs}
+    first = max(pairs, key=means.get)
+    parts = {
+        cause: np.mean([part[cause] for pair, _, part in points if pair == first])
+        for cause in points[0][2]
+    }
+    cause = max(parts, key=parts.get)
+    row = result.table.iloc[0]
+    assert row["contact"] == first and row["slip [m/s]"] == pytest.approx(means[first])
+    assert row["cause of this part"] == cause
+    assert result.verdict.startswith(f"{first}: slips") and f"cause: {cause}" in result.verdict
+    page = result.make_page(None)
+    assert page.verdict == result.verdict
+    told = re.search(r"Largest part: ([a-z ]+), ", " ".join(result.sentences))
+    fastest = max(points, key=lambda point: point[1])
+    if told is not None and told[1] != max(parts, key=parts.get) and fastest[0] == first:
+        assert f"another cause: {cause}" in " ".join(result.sentences)
+
+
+def test_slip_of_worlds_does_not_depend_on_the_number_of_processes():
+    model = block(0.2, option='iterations="3"')
+    one, two = (
+        explain_slip_of_states(model, worlds=2, steps=40, spread=0.05, seed=7, workers=n)
+        for n in (1, 2)
+    )
+    assert [e.state for e in one.explanations] == [0, 1]
+    for a, b in zip(one.explanations, two.explanations, strict=True):
+        np.testing.assert_array_equal(a.speeds, b.speeds)
+        assert a.remedies == b.remedies
+    assert one.forces.equals(two.forces) and len(set(one.forces["state"])) == 2
+    # World 0 starts without noise, as without --worlds; the other ones differ.
+    alone = explain_slip_of_states(model, steps=40).explanations[0]
+    np.testing.assert_array_equal(alone.speeds, one.explanations[0].speeds)
+    assert not np.array_equal(alone.speeds, one.explanations[1].speeds)
+
+
 def test_slip_names_no_setting_twice():
     options = 'noslip_iterations="20" tolerance="1e-12" iterations="10" impratio="2"'
     model = block(0.2, option=options)

@@ -72,6 +72,51 @@ def test_two_bodies_between_which_a_load_is_not_determined_have_no_number():
     assert forces.table["normal force [N]"].isna().all() and "not determined" in str(forces)
 
 
+def test_three_feet_with_friction_determine_their_normal_forces_only():
+    problem = make_table(THREE, friction=0.5)
+    exact = lv.solve(problem, tol=1e-12)
+    forces = lv.contact_forces(problem, exact.impulse, dt=DT)
+    assert forces.determined == ("contact",) * 3 and np.isnan(forces.tangential).all()
+    np.testing.assert_allclose(forces.exact, WEIGHT * np.array([0.25, 0.25, 0.5]), rtol=1e-9)
+    squeezed = exact.impulse.copy()
+    squeezed[1:3], squeezed[4:6] = [0.01, 0.0], [-0.01, 0.0]  # Along the line of two feet.
+    assert lv.contact_forces(problem, squeezed, dt=DT, reference=exact).error.max() < 1e-9
+
+
+@pytest.mark.parametrize("turned", [0.0, 1e-4, 1e-3])
+def test_gripped_box_has_the_force_of_each_finger(turned):
+    """Friction on a box that is turned a little changes the forces of the fingers by less than 1 %."""
+    mujoco = pytest.importorskip(
+        "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+    )
+    model = mujoco.MjModel.from_xml_string("""<mujoco><option timestep="0.002"/><worldbody>
+      <body name="left" pos="-.05 0 1"><joint name="l" type="slide" axis="1 0 0"/>
+      <geom type="box" size=".01 .02 .02" mass=".1"/></body>
+      <body name="right" pos=".05 0 1"><joint name="r" type="slide" axis="-1 0 0"/>
+      <geom type="box" size=".01 .02 .02" mass=".1"/></body><body name="can" pos="0 0 1"><freejoint/>
+      <geom type="box" size=".0402 .01 .01" mass=".2"/></body></worldbody>
+      <actuator><motor joint="l" gear="20"/><motor joint="r" gear="20"/></actuator></mujoco>""")
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1.0
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    data.qpos[6] += turned / 2.0
+    mujoco.mj_forward(model, data)
+    problem, impulse = lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data)
+    forces = lv.contact_forces(
+        problem, impulse, dt=model.opt.timestep, pairs=lambda name: name[-2:]
+    )
+    assert len(forces.contacts) >= 8 and set(forces.determined) == {"pair"}
+    wanted = np.zeros(6)
+    for pair, own in forces.by_contact.groupby("bodies"):
+        total = 0.0
+        for k in own.index:
+            mujoco.mj_contactForce(model, data, k, wanted)
+            total += wanted[0]
+        np.testing.assert_allclose(own["pair force [N]"], total, rtol=1e-9)
+        assert own["pair error [N]"].max() < 1e-3 * total, pair
+
+
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_forces_of_mujoco_are_those_of_mj_contact_force(cone):
     mujoco = pytest.importorskip(
