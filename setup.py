@@ -177,7 +177,9 @@ class BuildKernels(build_ext):
         gc.enable()
         for module, c_module in zip(self.extensions, translated, strict=True):
             # Cython does not know which headers a header includes.
-            headers = sorted(map(str, Path(module.sources[0]).parent.glob("*.h")))
+            text = Path(c_module.sources[0]).read_text(encoding="utf-8")
+            headers = [str(h) for h in Path("lavender_ext").glob("*/*.h") if f'{h.name}"' in text]
+            headers += [h.replace(".h", "_body.h") for h in headers]
             module.sources = c_module.sources
             module.depends = [
                 path for path in c_module.depends if not is_part_of_cython(path)
@@ -376,7 +378,7 @@ def extension(path):
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
         # headers of C that several widths of vectors share, and those of NumPy
-        include_dirs=[path.parent.as_posix(), numpy.get_include()],
+        include_dirs=[path.parent.as_posix(), ".", numpy.get_include()],
         extra_compile_args=[*COMPILE_ARGS, *filter(is_known, options)],
         extra_link_args=LINK_ARGS,
     )

@@ -123,12 +123,13 @@ def read_dialect(c_file: Path) -> list[str]:
     compiler = shlex.split(os.environ.get("CC", "cc"))
     folders = [
         sysconfig.get_paths()["include"],
+        str(ROOT),
         str(ROOT / "lavender_ext" / "batch"),
         numpy.get_include(),
     ]
     found: dict[str, None] = {}
     text = c_file.read_text(encoding="utf-8")
-    guarded = PLAIN[0].removeprefix("-D") in text or '"lanes.h"' in text
+    guarded = PLAIN[0].removeprefix("-D") in text or re.search(r'(lanes|manifolds)\.h"', text)
     for more in (
         ([], PLAIN) if guarded else ([],)
     ):  # without the guard both compilations are the same

@@ -41,6 +41,8 @@ from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
+from lavender_ext.sweep.manifolds cimport (bind_contacts, contacts_t, fits_lanes, free_manifolds, has_avx2, manifolds_t,
+                                           pack_manifolds, sweep_manifolds)
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, pack_blocks_in_order, packed_t, packed_workspace_size,
                                         refresh_packed_contacts, sweep_packed)
 from lavender_ext.sweep.pgs cimport sweep_bodies
@@ -48,6 +50,8 @@ from lavender_ext.sweep.pgs cimport sweep_bodies
 
 cdef enum:
     MIN_PACKED_SWEEPS = 4       # Pack the blocks from this many sweeps on: packing costs as much as a few sweeps.
+    MAX_UNROLLED_SWEEPS = 8     # Groups hold the manifolds of all sweeps of a substep up to this many sweeps,
+    MIN_LANES = 2               # and must have this many manifolds on average.
 
 
 cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
@@ -130,73 +134,49 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
     out[1] = s.energy
 
 
-cdef struct packs_t:            # packed blocks of the substeps of a call: in odd phases the contacts are visited in reverse
-    packed_t packed[2]
-    double* workspace[2]        # NULL: blocks are not packed
-    bint is_valid[2]
-
-
-cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
-                                     packs_t* packs) noexcept nogil:
-    """Run the sweeps over packed blocks and return True, or return False if they cannot be packed.
-
-    Records are used again in a later substep if all rows are still the same, except for the right-hand sides of contacts.
-    """
-    cdef int32_t way = e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
-    if e.head[H_REBUILT] or r.n_joints > 0:
-        packs.is_valid[0] = packs.is_valid[1] = False
-    if packs.is_valid[way]:
-        refresh_packed_contacts(p, e.order, &packs.packed[way], e.impulse)
-    elif not pack_blocks_in_order(p, r, e.order, False, packs.workspace[way], e.impulse, &packs.packed[way]):
-        return False
-    packs.is_valid[way] = True
-    sweep_packed(p, r, e.order, &packs.packed[way], sweeps, e.impulse, e.dv)
-    return True
-
-
-cdef inline void solve_substep(engine_t* e, int32_t sweeps, packs_t* packs, bint measures, double* curve,
-                               double* scratch) noexcept nogil:
-    """Solve the substep's velocity problem by sweeps; sweeps = 0: warm start and its error only.
-
-    With `measures`, the errors before and after the sweeps are measured. curve (sweeps + 1, 2) or NULL receives max |e_n| and E
-    before the first sweep and after each.
-    """
-    cdef blocks_t p
-    cdef rows_t r
-    cdef double* out = e.setting + S_OUT
-    cdef int32_t i, mode
-    cdef uint64_t rng
-    cdef bint packs_blocks
-    bind_substep_problem(e, &p, &r)
-    # warm start, and error before the first sweep
+cdef inline void start_solve(engine_t* e, const blocks_t* p, const rows_t* r, bint measures) noexcept nogil:
+    """Apply the warm start; with `measures`, write the error before the first sweep."""
+    cdef int32_t i
     if e.head[H_WARM_START]:
-        compute_velocity_change(&p, &r, e.impulse, e.dv)
+        compute_velocity_change(p, r, e.impulse, e.dv)
     else:
         for i in range(6 * e.size[N_DYNAMIC]):
             e.dv[i] = 0.0
     if measures:
-        measure_contact_errors(e, out + 4, out + 6)
+        measure_contact_errors(e, e.setting + S_OUT + 4, e.setting + S_OUT + 6)
+
+
+cdef inline void sweep_single_blocks(engine_t* e, const blocks_t* p, const rows_t* r, double* curve, double* scratch) noexcept nogil:
+    """Run the sweeps of a substep block by block."""
+    cdef int32_t i, mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
+    # every substep has its own random stream, a function of seed and substep alone
+    cdef uint64_t rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
+    for i in range(e.head[H_ITERATIONS]):               # over joints, then contacts
+        update_sweep_order(mode, i == 0, e.order, 0, r.n_joints, &rng)
+        update_sweep_order(mode, i == 0, e.order, r.n_joints, p.n_blocks, &rng)
+        sweep_bodies(p, r, e.order, p.n_blocks, e.impulse, e.dv)
+        if curve != NULL:
+            record_sweep_error(e, p, r, curve + 2 * (i + 1), scratch)
+
+
+cdef inline void solve_substep(engine_t* e, bint sweeps, bint measures, double* curve, double* scratch) noexcept nogil:
+    """Solve the substep's velocity problem by sweeps; without `sweeps` only apply the warm start and measure its error.
+
+    With `measures`, the errors before and after the sweeps are measured. curve (iterations + 1, 2) or NULL receives max |e_n| and
+    E before the first sweep and after each.
+    """
+    cdef blocks_t p
+    cdef rows_t r
+    bind_substep_problem(e, &p, &r)
+    start_solve(e, &p, &r, measures)
     if curve != NULL:
         record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
         return
-    # sweeps, over packed blocks if that pays, with the same bits
     set_sweep_order_of_blocks(e)
-    sweeps = e.head[H_ITERATIONS]
-    packs_blocks = (packs != NULL and sweeps >= MIN_PACKED_SWEEPS
-                    and e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM)   # The order does not change.
-    if not packs_blocks or not sweep_packed_blocks(e, &p, &r, sweeps, packs):
-        mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
-        # every substep has its own random stream, a function of seed and substep alone
-        rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
-        for i in range(sweeps):                         # over joints, then contacts
-            update_sweep_order(mode, i == 0, e.order, 0, r.n_joints, &rng)
-            update_sweep_order(mode, i == 0, e.order, r.n_joints, p.n_blocks, &rng)
-            sweep_bodies(&p, &r, e.order, p.n_blocks, e.impulse, e.dv)
-            if curve != NULL:
-                record_sweep_error(e, &p, &r, curve + 2 * (i + 1), scratch)
+    sweep_single_blocks(e, &p, &r, curve, scratch)
     if measures:
-        measure_contact_errors(e, out + 5, out + 7)
+        measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
 cdef inline int32_t first_dynamic_body_of_pair(const engine_t* e, const int32_t* pair) noexcept nogil:
@@ -260,7 +240,7 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    solve_substep(&e, sweeps, NULL, True, NULL, NULL)
+    solve_substep(&e, sweeps != 0, True, NULL, NULL)
 
 
 cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -272,7 +252,7 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    solve_substep(&e, 1, NULL, True, curve, scratch)
+    solve_substep(&e, True, True, curve, scratch)
 
 
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
@@ -283,26 +263,17 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
     return finish_substep(&e)
 
 
-cdef inline int32_t run_substeps(engine_t* e, int32_t n, packs_t* packs, int32_t* done) noexcept nogil:
-    """Run up to n substeps; `done` receives the number completed. The errors of the sweeps are measured in the last one.
-
-    packs: memory for packed blocks, each of the size that `packed_workspace_size` returns for the capacities, or NULL: slower,
-    same bits.
-    """
-    cdef int32_t status
+cdef inline int32_t run_substeps(engine_t* e, int32_t n, int32_t* done) noexcept nogil:
+    """Run up to n substeps; `done` receives the number completed. The errors of the sweeps are measured in the last one."""
+    cdef int32_t status = OK
     done[0] = 0
-    if packs != NULL:
-        packs.is_valid[0] = packs.is_valid[1] = False
-    while done[0] < n:
+    while status == OK and done[0] < n:
         status = prepare_substep(e)
-        if status != OK:
-            return status
-        solve_substep(e, 1, packs, done[0] == n - 1, NULL, NULL)
-        status = finish_substep(e)
-        done[0] += 1
-        if status != OK:
-            return status
-    return OK
+        if status == OK:
+            solve_substep(e, True, done[0] == n - 1, NULL, NULL)
+            status = finish_substep(e)
+            done[0] += 1
+    return status
 
 
 cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -311,7 +282,72 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
     cdef engine_t e
     cdef int64_t n[3]
     bind_engine_arrays(size, real, index, keys, &e, n)
-    return run_substeps(&e, n_substeps, NULL, done)
+    return run_substeps(&e, n_substeps, done)
+
+
+cdef struct packs_t:            # packed blocks of the substeps of a call: in odd phases the contacts are visited in reverse
+    manifolds_t manifolds       # groups of manifolds, in the order of the substep `way`
+    bint has_manifolds          # the rows of these groups are those of the present substep
+    int32_t way
+    packed_t packed[2]          # pairs of blocks, for each order
+    double* workspace[2]
+    bint is_valid[2]
+
+
+cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t lanes, packs_t* packs) noexcept nogil:
+    """Run the sweeps over packed blocks, with the same bits, and return True, or return False if they cannot be packed.
+
+    Groups and pairs are used again in a later substep if all rows are still the same, except for the right-hand sides of contacts.
+    """
+    cdef int32_t way = e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0, sweeps = e.head[H_ITERATIONS]
+    cdef contacts_t contacts
+    if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM or sweeps < MIN_PACKED_SWEEPS:
+        return False                                    # The order changes from sweep to sweep, or packing does not pay.
+    if e.head[H_REBUILT] or r.n_joints > 0:
+        packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
+        if lanes > 1 and fits_lanes(p, r):
+            contacts = bind_contacts(p, r, e.order)
+            packs.has_manifolds = pack_manifolds(&contacts, sweeps if sweeps <= MAX_UNROLLED_SWEEPS else 1, MIN_LANES,
+                                                 &packs.manifolds)
+            packs.way = way
+    if packs.has_manifolds:
+        contacts = bind_contacts(p, r, e.order)
+        sweep_manifolds(&contacts, &packs.manifolds, lanes == 4, sweeps, way != packs.way, e.impulse, e.dv)
+        return True
+    if packs.is_valid[way]:
+        refresh_packed_contacts(p, e.order, &packs.packed[way], e.impulse)
+    elif not pack_blocks_in_order(p, r, e.order, False, packs.workspace[way], e.impulse, &packs.packed[way]):
+        return False
+    packs.is_valid[way] = True
+    sweep_packed(p, r, e.order, &packs.packed[way], sweeps, e.impulse, e.dv)
+    return True
+
+
+cdef inline void solve_packed_substep(engine_t* e, int32_t lanes, packs_t* packs, bint measures) noexcept nogil:
+    """Solve the substep's velocity problem as `solve_substep`, with the same bits, over packed blocks if that pays."""
+    cdef blocks_t p
+    cdef rows_t r
+    bind_substep_problem(e, &p, &r)
+    start_solve(e, &p, &r, measures)
+    set_sweep_order_of_blocks(e)
+    if lanes == 0 or not sweep_packed_blocks(e, &p, &r, lanes, packs):
+        sweep_single_blocks(e, &p, &r, NULL, NULL)
+    if measures:
+        measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
+
+
+cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, int32_t lanes, packs_t* packs, int32_t* done) noexcept nogil:
+    """Run up to n substeps as `run_substeps`, with the same bits."""
+    cdef int32_t status = OK
+    done[0] = 0
+    packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
+    while status == OK and done[0] < n:
+        status = prepare_substep(e)
+        if status == OK:
+            solve_packed_substep(e, lanes, packs, done[0] == n - 1)
+            status = finish_substep(e)
+            done[0] += 1
+    return status
 
 
 cdef class Buffers:
@@ -326,6 +362,7 @@ cdef class Buffers:
     cdef uint64_t[::1] keys
     cdef double[::1] workspace
     cdef packs_t packs
+    cdef public int32_t lanes       # 4 with AVX2, 2 without it; 1: pairs of blocks, 0: single blocks; the bits are the same
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -341,6 +378,15 @@ cdef class Buffers:
         self.workspace = np.empty(2 * length)
         self.packs.workspace[0] = &self.workspace[0]
         self.packs.workspace[1] = &self.workspace[length]
+        self.lanes = 4 if has_avx2() else 2
+
+    def __dealloc__(self):
+        free_manifolds(&self.packs.manifolds)
+
+    @property
+    def groups(self):
+        """Number of groups of manifolds in the last substep, 0 if contacts were not in lanes."""
+        return self.packs.manifolds.n_groups if self.packs.has_manifolds else 0
 
     def count_broad_phase_pairs(self):
         """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""
@@ -360,14 +406,14 @@ cdef class Buffers:
     def solve(self, bint sweeps=True):
         """Solve the prepared problem; without `sweeps` only apply and measure the warm start."""
         with nogil:
-            solve_substep(&self.e, sweeps, NULL, True, NULL, NULL)
+            solve_substep(&self.e, sweeps, True, NULL, NULL)
 
     def sweep_and_record_errors(self, double[:, ::1] curve):
         """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            solve_substep(&self.e, 1, NULL, True, &curve[0, 0], &scratch[0])
+            solve_substep(&self.e, True, True, &curve[0, 0], &scratch[0])
 
     def apply_impulses(self):
         """Compute dv and the final error of impulses that another solver has written."""
@@ -389,7 +435,7 @@ cdef class Buffers:
         """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = run_substeps(&self.e, n, &self.packs, &done)
+            status = run_packed_substeps(&self.e, n, self.lanes, &self.packs, &done)
         return status, done
 
     def arrays(self):

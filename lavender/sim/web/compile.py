@@ -44,7 +44,6 @@ MODULES = (
     "engine.substep",
     "driver.memory",
     "judge.measure",
-    "sweep.packed",
     "sweep.pgs",
 )
 #: Largest size of a finished module [bytes].
