@@ -146,7 +146,8 @@ cdef inline void start_solve(engine_t* e, const blocks_t* p, const rows_t* r, bi
         measure_contact_errors(e, e.setting + S_OUT + 4, e.setting + S_OUT + 6)
 
 
-cdef inline void sweep_single_blocks(engine_t* e, const blocks_t* p, const rows_t* r, double* curve, double* scratch) noexcept nogil:
+cdef inline void sweep_single_blocks(engine_t* e, const blocks_t* p, const rows_t* r, double* curve,
+                                     double* scratch) noexcept nogil:
     """Run the sweeps of a substep block by block."""
     cdef int32_t i, mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own random stream, a function of seed and substep alone
