@@ -26,12 +26,11 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.pairs import ROOT, Answer, Checkout, build_base, serve
+from benchmarks.pairs import ROOT, Answer, Checkout, build_base, run_timed, serve
 
 TOL, RIGHT = 1e-6, 1e-5
 LIMIT = 5.0  # [s] Time limit of a solve.
@@ -89,9 +88,9 @@ def solve_program(path: str, optimum: float, solver: str) -> Answer:
     import lavender as lv
 
     arrays = read_program(path)
-    begun = process_time()
-    answer = lv.solve_qp(**arrays, solver=solver, tol=TOL, time_limit=LIMIT)
-    seconds = process_time() - begun
+    answer, seconds = run_timed(
+        lambda: lv.solve_qp(**arrays, solver=solver, tol=TOL, time_limit=LIMIT)
+    )
     right = is_right(arrays, optimum, answer.x)
     return {
         "status": answer.solution.status.name,
@@ -110,13 +109,10 @@ def solve_program_alone(path: str, optimum: float, solver: str) -> Answer:
     given = {k: sp.csc_matrix(v) if sp.issparse(v) else v for k, v in arrays.items()}
     if solver in ("daqp", "quadprog"):
         given = {k: v.toarray() if sp.issparse(v) else v for k, v in given.items()}
-    begun = process_time()
-    x = qpsolvers.solve_qp(**given, solver=solver, **ALONE.get(solver, {}))
-    return {
-        "right": is_right(arrays, optimum, x),
-        "found": x is not None,
-        "seconds": process_time() - begun,
-    }
+    x, seconds = run_timed(
+        lambda: qpsolvers.solve_qp(**given, solver=solver, **ALONE.get(solver, {}))
+    )
+    return {"right": is_right(arrays, optimum, x), "found": x is not None, "seconds": seconds}
 
 
 def solve_problem(path: str, solver: str, out: str) -> Answer:
@@ -126,9 +122,7 @@ def solve_problem(path: str, solver: str, out: str) -> Answer:
     import lavender as lv
 
     problem = replace(lv.load(path), copy=False, guess=None)
-    begun = process_time()
-    solution = lv.solve(problem, solver, tol=TOL, time_limit=LIMIT)
-    seconds = process_time() - begun
+    solution, seconds = run_timed(lambda: lv.solve(problem, solver, tol=TOL, time_limit=LIMIT))
     np.save(out, solution.impulse)
     return {"status": solution.status.name, "work": dict(solution.work), "seconds": seconds}
 
@@ -255,10 +249,11 @@ def write_drawn_problems(count: int, folder: Path) -> list[tuple[str, Path]]:
     """Write the problems of the first seeds of `regret`; return (group, file)."""
     from dataclasses import replace
 
-    from benchmarks.regret import draw_problems
+    from benchmarks.random_families import draw_problems
+    from benchmarks.regret import MAX_ROWS
 
     files = []
-    for source, seed, problem in draw_problems(0, count, [], []):
+    for source, seed, problem in draw_problems(0, count, MAX_ROWS):
         path = folder / f"{source}_{seed}.npz"
         replace(problem, guess=None).save(path)
         files.append((f"drawn: {source}", path))

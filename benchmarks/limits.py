@@ -1,27 +1,19 @@
-"""Times of calls under a time limit.
+"""Calls under a time limit, on drawn problems: answers and times.
 
-    python -m benchmarks limits [--case 'granularF(n=12)' ...] [--solver auto ...] [--repeats 5]
-    python -m benchmarks limits --programs 1000 [--solver auto --solver clarabel ...]
-    python -m benchmarks limits --sheet auto|prepared [--count 400] [--seed 0]
-
-Prints medians of wall and CPU time of cold calls divided by their limit, the number of sweeps or steps, the relative
-residual, and the residual of the start; before the limits the smallest CPU time of one cold sweep without a limit,
-set-up and judge included. With --programs, it prints for each solver in which share of quadratic programs of 5 to 1,000
-variables the CPU time of `solve_qp`, without the time inside of the backend's package and imports, is at most the limit
-plus OVERHEAD. `python -m benchmarks rates` measures the costs that decide what starts under a limit.
+    python -m benchmarks limits [--sheet auto|prepared|programs] [--count 400] [--seed 0] [--solver clarabel ...]
 
 The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same limit: structures of 60 to
 4,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time of prepared
-solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms.
+solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms. The sheet
+`programs` prints for each solver in which share of quadratic programs of 5 to 1,000 variables the CPU time of
+`solve_qp`, without the time inside of the backend's package and imports, is at most the limit plus OVERHEAD.
 """
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from statistics import median
-from time import perf_counter, thread_time
+from functools import partial
+from time import thread_time
 from typing import Any
 
 import click
@@ -32,24 +24,14 @@ import lavender as lv
 import lavender.solving.loop
 from benchmarks.core_problems import forms, fresh, lattice_pile, stacks
 from benchmarks.output import markdown
+from benchmarks.pairs import run_timed
+from benchmarks.peers.backend_time import measure_backend_time
 from benchmarks.scale_structures import STRUCTURES, build
 from lavender import registry, suite
 from lavender.problem import Problem
 from lavender.solvers.registry import get
 from lavender_ext.core.deadline import play_clock
 
-CASES = (
-    "stack(n=64)",
-    "chain(n=33)",
-    "pyramidF(k=6)",
-    "stack(n=5000)",
-    "granular(n=12)",
-    "granularF(n=12)",
-    "dense 300 x 100",
-    "dense 3000 x 300",
-    "matrix 300",
-    "matrix 2400",
-)
 LIMITS = (1e-3, 1e-2)  # s
 OVERHEAD = 5e-3  # s
 SHEET_SWEEPS = (
@@ -71,62 +53,6 @@ FORM_NAMES = ("bodies", "matrix", "J and M")
 TOLERANCE, REPEATS = 1e-6, 3
 
 Line = dict[str, Any]
-# the first one that accepts the problem's form is used
-SWEEPS = (
-    "sequential_impulses",
-    "block_gauss_seidel",
-    "pgs",
-)
-
-
-def problem_of(name: str) -> Callable[[], Problem]:
-    """Return a function that makes a problem without derived data: a case, a case in another form, or a dense one."""
-    kind, _, rest = name.partition(" ")
-    if kind not in ("dense", "matrix"):
-        case, _, form = name.partition(" as ")
-        problem = suite.case(case).problem
-        given = forms(problem)[form] if form else problem
-        return lambda: fresh(given)
-    rng = np.random.default_rng(0)
-    m = int(rest.split(" x ")[0])
-    if kind == "dense":
-        n = int(rest.split(" x ")[1])
-        half = rng.normal(size=(n, n))
-        jac = rng.normal(size=(m, n))
-        free = rng.normal(size=n)
-        cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
-        return lambda: Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
-    half = rng.normal(size=(m, m // 2))
-    b = rng.normal(size=m)
-    matrix = half @ half.T / m + 0.01 * np.eye(m)
-    return lambda: Problem.contact(matrix, b, 0.5, friction="cone")
-
-
-def calls(
-    make: Callable[[], Problem], solver: str, limit: float, repeats: int
-) -> tuple[float, float, Any]:
-    """Return medians of wall and CPU time divided by the limit, and the last solution."""
-    wall = []
-    cpu = []
-    found = None
-    for _ in range(repeats):
-        problem = make()
-        begun, clock = thread_time(), perf_counter()
-        found = lv.solve(problem, solver, time_limit=limit)
-        wall.append(perf_counter() - clock)
-        cpu.append(thread_time() - begun)
-    return median(wall) / limit, median(cpu) / limit, found
-
-
-def least(make: Callable[[], Problem], call: Callable[[Problem], Any], repeats: int = 3) -> float:
-    """Return the smallest CPU time [s] of a call on new problems."""
-    times = []
-    for _ in range(repeats):
-        problem = make()
-        start = thread_time()
-        call(problem)
-        times.append(thread_time() - start)
-    return min(times)
 
 
 # -- quadratic programs ------------------------------------------------------------------------------
@@ -202,45 +128,6 @@ def draw_program(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def count_foreign_time() -> Iterator[list[float]]:
-    """Yield a list whose entry grows by the CPU time [s] inside of other packages that solve programs."""
-    import clarabel
-    import osqp
-    import qpsolvers
-
-    spent = [0.0]
-
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **options: Any) -> Any:
-            begin = thread_time()
-            try:
-                return function(*arguments, **options)
-            finally:
-                spent[0] += thread_time() - begin
-
-        return call
-
-    class Solver:
-        """Clarabel's solver with a clock."""
-
-        def __init__(self, *arguments: Any) -> None:
-            self.solve = timed(timed(original)(*arguments).solve)
-
-    original = clarabel.DefaultSolver
-    parts = ((qpsolvers, "solve_problem"), (osqp.OSQP, "setup"), (osqp.OSQP, "solve"))
-    saved = [(owner, name, getattr(owner, name)) for owner, name in parts]
-    try:
-        clarabel.DefaultSolver = Solver
-        for owner, name, function in saved:
-            setattr(owner, name, timed(function))
-        yield spent
-    finally:
-        clarabel.DefaultSolver = original
-        for owner, name, function in saved:
-            setattr(owner, name, function)
-
-
 def measure_programs(count: int, solvers: tuple[str, ...]) -> list[list[Any]]:
     """Return the rows of the table of `--programs`."""
     own: dict[str, list[float]] = {name: [] for name in solvers}
@@ -250,18 +137,16 @@ def measure_programs(count: int, solvers: tuple[str, ...]) -> list[list[Any]]:
         )
         lv.solve_qp(np.eye(1), [0.0], G=[[1.0], [-1.0]], h=[-1.0, -1.0], solver=name)
     rng = np.random.default_rng(0)
-    with count_foreign_time() as spent:
-        for i in range(count):
-            arrays = draw_program(rng)
-            limit = LIMITS[i % 2]
-            for name in solvers:
-                problem = lv.Problem.from_qp(**arrays)
-                if get(name).refuses(problem):
-                    continue
-                spent[0] = 0.0
-                begin = thread_time()
-                lv.solve_qp(problem, name, tol=1e-6, time_limit=limit)
-                own[name].append(thread_time() - begin - spent[0] - limit)
+    for i in range(count):
+        arrays = draw_program(rng)
+        limit = LIMITS[i % 2]
+        for name in solvers:
+            problem = lv.Problem.from_qp(**arrays)
+            if get(name).refuses(problem):
+                continue
+            with measure_backend_time(name) as spent:
+                call = partial(lv.solve_qp, problem, name, tol=1e-6, time_limit=limit)
+                own[name].append(run_timed(call)[1] - sum(spent) - limit)
     rows = []
     for name, times in own.items():
         share = 100.0 * np.mean(np.array(times) <= OVERHEAD)
@@ -369,9 +254,8 @@ def measure_auto(k: int, seed: int) -> Line:
     for i in range(REPEATS):
         for j, solver in enumerate(names):
             cold = fresh(problem)
-            begun = thread_time()
-            solution = lv.solve(cold, solver, impulse=start, tol=TOLERANCE, time_limit=limit)
-            time = thread_time() - begun
+            given = {"impulse": start, "tol": TOLERANCE, "time_limit": limit}
+            solution, time = run_timed(partial(lv.solve, cold, solver, **given))
             runs[i, j] = solution.residual.relative, time / limit
     (own, over) = np.median(runs, axis=0)[0]
     others = np.median(runs, axis=0)[1:, 0]
@@ -469,9 +353,8 @@ def measure_prepared(k: int, seed: int) -> list[Line]:
         prepared = lv.prepare(fresh(problem), solver)
         for _ in range(3):
             b = problem.b * (1.0 + 0.01 * rng.random())
-            begun = thread_time()
-            status = prepared.solve(b=b, tol=1e-8, time_limit=limit).status
-            time = thread_time() - begun
+            call = partial(prepared.solve, b=b, tol=1e-8, time_limit=limit)
+            solution, time = run_timed(call)
             lines.append(
                 {
                     "name": f"{name}, {problem.law}",
@@ -480,7 +363,7 @@ def measure_prepared(k: int, seed: int) -> list[Line]:
                     "limit": limit,
                     "time": time,
                     "excess": time - 2.0 * limit,
-                    "status": status.name,
+                    "status": solution.status.name,
                 }
             )
     return lines
@@ -538,77 +421,25 @@ def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
 
 
 @click.command("limits")
-@click.option("--case", "names", multiple=True, help=f"Default: {', '.join(CASES)}.")
-@click.option("--solver", "solvers", multiple=True, default=("auto",), show_default=True)
-@click.option("--repeats", default=5, show_default=True)
-@click.option("--programs", default=0, help="Number of quadratic programs, in place of cases.")
 @click.option(
     "--sheet",
-    type=click.Choice(["auto", "prepared"]),
-    help="Drawn contact problems, in place of cases.",
+    type=click.Choice(["auto", "prepared", "programs"]),
+    default="auto",
+    show_default=True,
 )
+@click.option("--solver", "solvers", multiple=True, default=("auto",), help="Of the programs.")
 @click.option("--count", default=400, show_default=True, help="Number of problems of a sheet.")
 @click.option("--seed", default=0, show_default=True)
-def command(
-    names: tuple[str, ...],
-    solvers: tuple[str, ...],
-    repeats: int,
-    programs: int,
-    sheet: str | None,
-    count: int,
-    seed: int,
-) -> None:
+def command(sheet: str, solvers: tuple[str, ...], count: int, seed: int) -> None:
     """Measure calls under time limits."""
-    if sheet:
+    if sheet != "programs":
         print_sheet(sheet, count, seed)
         return
-    if programs:
-        head = [
-            "solver",
-            "programs",
-            "within limit + 5 ms",
-            "above the limit in 1 % [ms]",
-            "largest [ms]",
-        ]
-        click.echo(markdown(head, measure_programs(programs, solvers)))
-        return
-    lv.solve(problem_of("dense 30 x 20")(), time_limit=1e-2)
     head = [
-        "problem",
-        "rows",
         "solver",
-        "one sweep [ms]",
-        "limit [ms]",
-        "wall",
-        "CPU",
-        "iterations",
-        "relative",
-        "of the start",
+        "programs",
+        "within limit + 5 ms",
+        "above the limit in 1 % [ms]",
+        "largest [ms]",
     ]
-    rows = []
-    for name in names or CASES:
-        make = problem_of(name)
-        problem = make()
-        start = lv.residual(problem, problem.start()).relative
-        sweeps = next(other for other in SWEEPS if not get(other).refuses(problem))
-        alone = least(make, lambda p, s=sweeps: lv.solve(p, s, tol=0.0, max_iter=1), repeats)  # type: ignore[misc]
-        for solver in solvers:
-            if get(solver).refuses(problem):
-                continue
-            for limit in LIMITS:
-                wall, cpu, found = calls(make, solver, limit, repeats)
-                rows.append(
-                    [
-                        name,
-                        problem.m,
-                        solver,
-                        f"{1e3 * alone:.2f}",
-                        f"{1e3 * limit:g}",
-                        f"{wall:.2f}",
-                        f"{cpu:.2f}",
-                        found.iterations,
-                        f"{found.residual.relative:.1e}",
-                        f"{start:.1e}",
-                    ]
-                )
-    click.echo(markdown(head, rows))
+    click.echo(markdown(head, measure_programs(count, solvers)))

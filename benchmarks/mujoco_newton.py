@@ -10,8 +10,9 @@ thread. Making the problem, factoring M and judging the zero impulse are not tim
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown, out_option, write_json
-from benchmarks.pairs import time_alternately
+from benchmarks.pairs import time_anew
 from lavender.io import mujoco as reader
 from lavender.problem import Problem
 
@@ -47,11 +48,6 @@ def list_models(folders: tuple[Path, ...]) -> list[Path]:
     for folder in folders:
         found += sorted(folder.rglob("scene*.xml"))
     return found
-
-
-def measure_minimum(call: Callable[[], Any], prepare: Callable[[], Any], repeats: int) -> float:
-    """Return the smallest CPU time [s] of a call; `prepare` is called before each one and is not timed."""
-    return float(time_alternately(call, rounds=repeats, before=prepare).min())
 
 
 def collect_states(path: Path, mujoco: Any) -> Iterator[tuple[Any, Any, np.ndarray]]:
@@ -101,8 +97,8 @@ def measure_mujoco(
         mujoco.mj_fwdConstraint(model, data)
         problem = lv.io.from_mujoco(model, data)
         for model.opt.tolerance in TOLERANCES:
-            elapsed = measure_minimum(
-                lambda: mujoco.mj_fwdConstraint(model, data), begin_solve, repeats
+            elapsed = time_anew(
+                begin_solve, lambda _: mujoco.mj_fwdConstraint(model, data), repeats
             )
             if lv.residual(problem, reader.impulse(model, data)).relative <= TOL:
                 return problem, elapsed
@@ -120,34 +116,25 @@ def copy_problem(problem: Problem) -> Problem:
 
 def measure_lavender(problem: Problem, repeats: int, worlds: int) -> tuple[bool, float, float]:
     """Return whether `solve` reaches TOL, and the times [s] of `solve` and, for each problem, of `solve_many`."""
-    copies: list[Problem] = []
 
-    def copy_one() -> None:
-        copies[:] = [copy_problem(problem)]
-
-    def copy_all() -> None:
-        copies[:] = [copy_problem(problem) for _ in range(worlds)]
+    def copy_all() -> list[Problem]:
+        return [copy_problem(problem) for _ in range(worlds)]
 
     found = lv.solve(copy_problem(problem), tol=TOL).residual
-    single = measure_minimum(lambda: lv.solve(copies[0], tol=TOL), copy_one, repeats)
-    many = (
-        measure_minimum(lambda: lv.solve_many(copies, tol=TOL), copy_all, max(2, repeats // 4))
-        / worlds
+    single = time_anew(
+        partial(copy_problem, problem), lambda copy: lv.solve(copy, tol=TOL), repeats
     )
-    return found.relative <= max(TOL, 2.0 * found.roundoff_floor), single, many
+    many = time_anew(copy_all, lambda copies: lv.solve_many(copies, tol=TOL), max(2, repeats // 4))
+    return found.relative <= max(TOL, 2.0 * found.roundoff_floor), single, many / worlds
 
 
 def name_class(m: int) -> str:
     """Return the class of a problem by its rows."""
     k = sum(m >= limit for limit in SIZE_LIMITS)
     edges = [0, *SIZE_LIMITS, 0]
-    return (
-        f"under {edges[1]}"
-        if k == 0
-        else f"{edges[k]}-{edges[k + 1]}"
-        if edges[k + 1]
-        else f"{edges[k]} or more"
-    )
+    if k == 0:
+        return f"under {edges[1]}"
+    return f"{edges[k]}-{edges[k + 1]}" if edges[k + 1] else f"{edges[k]} or more"
 
 
 def compute_mean(values: list[float]) -> float:

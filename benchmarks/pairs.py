@@ -25,9 +25,10 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import process_time_ns
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,20 +38,35 @@ MAX_CALLS = 10_000
 ROUNDS = 15
 
 Answer = dict[str, Any]
+Result = TypeVar("Result")
 
 
-def time_call(call: Callable[[], Any], count: int = 1) -> float:
-    """Return the CPU time [s] of one of `count` calls, without collections of garbage."""
+def run_timed(call: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of a call and its CPU time [s], without collections of garbage."""
     collects = gc.isenabled()
     gc.disable()
     try:
         begun = process_time_ns()
-        for _ in range(count):
-            call()
-        return 1e-9 * (process_time_ns() - begun) / count
+        result = call()
+        return result, 1e-9 * (process_time_ns() - begun)
     finally:
         if collects:
             gc.enable()
+
+
+def time_call(call: Callable[[], Any], count: int = 1) -> float:
+    """Return the CPU time [s] of one of `count` calls."""
+
+    def repeat() -> None:
+        for _ in range(count):
+            call()
+
+    return run_timed(repeat)[1] / count
+
+
+def time_anew(make: Callable[[], Any], call: Callable[[Any], Any], repeats: int = 3) -> float:
+    """Return the smallest CPU time [s] of a call, each time on what `make` has returned anew."""
+    return min(run_timed(partial(call, make()))[1] for _ in range(repeats))
 
 
 def choose_count(call: Callable[[], Any]) -> int:
@@ -133,7 +149,9 @@ def serve(calls: Mapping[str, Callable[..., Answer]]) -> None:
 class Checkout:
     """A process in a built checkout that runs a file of this one, which calls `serve`."""
 
-    def __init__(self, folder: Path, server: str | Path = __file__) -> None:
+    def __init__(
+        self, folder: Path, server: str | Path = __file__, python: str = sys.executable
+    ) -> None:
         path = str(Path(server).resolve())
         # The other checkout may have another version of this module, or none.
         code = (
@@ -145,15 +163,14 @@ class Checkout:
         )
         environment = os.environ | {"PYTHONPATH": str(folder)}
         self.process = subprocess.Popen(
-            [sys.executable, "-c", code],
+            [python, "-c", code],
             cwd=folder,
             env=environment,
             text=True,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
-        self.folder = folder
-        self.server = server
+        self.arguments = folder, server, python
 
     def ask(self, *call: Any, limit: float | None = None) -> Answer:
         """Return the answer of a call; of one that ends the process, or takes longer than `limit` [s], its status."""
@@ -167,8 +184,13 @@ class Checkout:
         if line:
             return dict(json.loads(line))
         ended = f"process ended ({self.process.wait()})"
-        self.__init__(self.folder, self.server)  # type: ignore[misc]
+        self.__init__(*self.arguments)  # type: ignore[misc]
         return {"status": ended, "seconds": float("nan")}
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.communicate()
 
 
 @contextmanager

@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from time import thread_time
 from typing import Any
 
 import click
@@ -23,8 +22,8 @@ from scipy.optimize import nnls
 
 import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
-from benchmarks.limits import CASES, least, problem_of
 from benchmarks.output import markdown
+from benchmarks.pairs import run_timed, time_anew
 from lavender import suite
 from lavender.base import rates
 from lavender.base.lazy_import import import_numerical_modules
@@ -37,6 +36,18 @@ from lavender.solvers.registry import get
 RATES_PATH = Path(rates.RATES_PATH)
 SETUP_MARGIN = 1.5
 STORED_WEIGHT = 0.5  # Weight of a stored rate, compared with 1 for each measured time.
+CASES = (
+    "stack(n=64)",
+    "chain(n=33)",
+    "pyramidF(k=6)",
+    "stack(n=5000)",
+    "granular(n=12)",
+    "granularF(n=12)",
+    "dense 300 x 100",
+    "dense 3000 x 300",
+    "matrix 300",
+    "matrix 2400",
+)
 SETUP_CASES = (*CASES[1:-1], "granularF(n=5) as matrix", "granularF(n=5) as J and M", "matrix 1200")
 SETUP_SOLVERS = ("newton", "direct")
 SETUP_RATES = (
@@ -70,6 +81,29 @@ MEASURED_SWEEPS = 100  # The first sweeps cost more, and `auto` uses about as ma
 
 Fit = dict[str, float]  # Rate by name [ns].
 Line = tuple[str, dict[str, float], float]  # (problem, {rate: number of operations}, time [ns]).
+
+
+def problem_of(name: str) -> Callable[[], Problem]:
+    """Return a function that makes a problem without derived data: a case, a case in another form, or a dense one."""
+    kind, _, rest = name.partition(" ")
+    if kind not in ("dense", "matrix"):
+        case, _, form = name.partition(" as ")
+        problem = suite.case(case).problem
+        given = forms(problem)[form] if form else problem
+        return lambda: fresh(given)
+    rng = np.random.default_rng(0)
+    m = int(rest.split(" x ")[0])
+    if kind == "dense":
+        n = int(rest.split(" x ")[1])
+        half = rng.normal(size=(n, n))
+        jac = rng.normal(size=(m, n))
+        free = rng.normal(size=n)
+        cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+        return lambda: Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
+    half = rng.normal(size=(m, m // 2))
+    b = rng.normal(size=m)
+    matrix = half @ half.T / m + 0.01 * np.eye(m)
+    return lambda: Problem.contact(matrix, b, 0.5, friction="cone")
 
 
 def fit_rates(names: tuple[str, ...], lines: list[Line]) -> Fit:
@@ -133,10 +167,10 @@ def newton_lines() -> Iterator[Line]:
             state = get("newton").load()(form=form).prepare(fresh(problem))
             steps = run(fresh(problem)).work.get("factorisations", 0)
             # Reading the start and the result is not part of the solver's cost.
-            before = least(
+            before = time_anew(
                 lambda p=problem: fresh(p), lambda p: lv.solve(p, "block_gauss_seidel", max_iter=0)
             )  # type: ignore[misc]
-            time = 1e9 * (least(lambda p=problem: fresh(p), run) - before)  # type: ignore[misc]
+            time = 1e9 * (time_anew(lambda p=problem: fresh(p), run) - before)  # type: ignore[misc]
             if not steps or time <= 0.0:
                 continue
             if state.general is not None:
@@ -173,9 +207,9 @@ def pivot_lines() -> Iterator[Line]:
             if not steps or state is None:
                 continue
             width = 1.0 + max(problem.bandwidth)
-            setup = least(lambda p=problem: fresh(p), get("direct").load()().prepare)  # type: ignore[misc]
+            setup = time_anew(lambda p=problem: fresh(p), get("direct").load()().prepare)  # type: ignore[misc]
             time = 1e9 * (
-                least(lambda p=problem: fresh(p), lambda p: lv.solve(p, "direct")) - setup
+                time_anew(lambda p=problem: fresh(p), lambda p: lv.solve(p, "direct")) - setup
             )  # type: ignore[misc]
             if time > 0.0:
                 yield (
@@ -192,12 +226,9 @@ def sweep_lines() -> Iterator[Line]:
 
             def run(p: Problem, n: int) -> float:
                 prepared = lv.prepare(p, "anderson")
-                times = []
-                for _ in range(3):
-                    begun = thread_time()
-                    prepared.solve(max_iter=n, tol=0.0)
-                    times.append(thread_time() - begun)
-                return min(times)
+                return min(
+                    run_timed(lambda: prepared.solve(max_iter=n, tol=0.0))[1] for _ in range(3)
+                )
 
             p = fresh(problem)
             time = 1e9 * (run(p, MEASURED_SWEEPS) - run(p, 1)) / (MEASURED_SWEEPS - 1)
@@ -215,7 +246,7 @@ def measure_kernels() -> Fit:
         return lv.prepare(p, "newton", form="velocity").solve(tol=1e-9)
 
     steps = run(fresh(chain)).work["factorisations"]
-    sparse = least(lambda: fresh(chain), run) / (steps * state.general.work)
+    sparse = time_anew(lambda: fresh(chain), run) / (steps * state.general.work)
     return {"sparse velocities": 1e9 * SETUP_MARGIN * sparse}  # It decides under a time limit.
 
 
@@ -238,7 +269,7 @@ def measure_setups(name: str) -> Iterator[tuple[str, Callable[[], float], float]
         yield (
             name_of_solver,
             lambda s=solver, p=untouched: s.estimate_setup_cost(p),
-            least(ready, solver.prepare),
+            time_anew(ready, solver.prepare),
         )  # type: ignore[misc]
 
 

@@ -28,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
@@ -37,14 +38,13 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown, out_option, write_json
+from benchmarks.pairs import ROOT, Checkout
 from benchmarks.peers.adapters import check_siconos, contestants
 from benchmarks.scale_structures import HELD_OUT, STRUCTURES, build
 
-ROOT = Path(__file__).parents[1]
 PLAN = Path("lavender_ext", "newton", "plan.pxd")
 SIZES = (900, 3_000, 10_000, 30_000, 60_000, 200_000)
 MIN_GROWTH_ROWS = 2_500
-MAX_REPEATED_TIME = 0.5  # [s] Shorter solves run three times, and the smallest time counts.
 MAX_SLOWDOWN, MIN_LIMIT = (
     3.0,
     0.2,
@@ -69,73 +69,7 @@ CONTESTANTS: dict[str, tuple[Stage, ...]] = {
     "admm, relaxed": (("anderson", "cone", 100), ("admm", "cone", 0)),
     "sweeps then admm": (("anderson", "coulomb", 100), ("admm", "coulomb", 0)),
 }
-# Reads {path, stages, tol, limit} as JSON, writes the impulse to PATH.npy and {time, memory, work, stages} to stdout.
-WORKER = """
-import json, resource, sys, time
-from dataclasses import replace
-import numpy as np
-import lavender as lv
-task = json.loads(sys.argv[1])
-given = lv.load(task["path"])
-small = lv.Problem.contact(np.eye(3), [1.0, 0.5, 0.2], [0.5])
-for solver, law, _ in task["stages"]:
-    lv.solve(small.relaxed(law), solver)
-best, spent = float("inf"), 0.0
-while best == float("inf") or (best < task["repeat"] and spent < 3.0 * best):
-    problem = replace(given, copy=False)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    begun, start, impulse, work, names = time.perf_counter(), time.process_time(), None, {}, []
-    for solver, law, count in task["stages"]:
-        law_problem = problem if law in ("coulomb", problem.law) else problem.relaxed(law)
-        remaining = task["limit"] - (time.perf_counter() - begun)
-        if remaining <= 0.01:
-            break
-        solution = lv.solve(law_problem, solver, impulse=impulse, tol=task["tol"], time_limit=remaining,
-                            **({"max_iter": count} if count else {}))
-        impulse = solution.impulse
-        names += [stage.solver for stage in getattr(solution, "stages", ())] or [solver]
-        for key, value in solution.work.items():
-            work[key] = work.get(key, 0) + value
-        if len(task["stages"]) > 1 and lv.residual(problem, impulse).relative <= task["tol"]:
-            break
-    taken = time.process_time() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before if best == float("inf") else memory
-    best, spent = min(best, taken), spent + taken
-np.save(task["path"] + ".npy", impulse)
-print(json.dumps({"time": best, "memory": memory / 1024, "work": work, "stages": names}))
-"""
-
-
-def run_worker(
-    python: str, folder: Path, path: Path, stages: tuple[Stage, ...], limit: float, tol: float
-) -> dict[str, Any]:
-    """Run stages on a problem's file in a new process; return its measurement, empty if the process failed."""
-    task = {
-        "path": str(path),
-        "stages": stages,
-        "tol": tol,
-        "limit": limit,
-        "repeat": MAX_REPEATED_TIME,
-    }
-    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    Path(f"{path}.npy").unlink(missing_ok=True)
-    try:
-        done = subprocess.run(
-            [python, "-c", WORKER, json.dumps(task)],
-            cwd=folder,
-            env=os.environ | variables,
-            text=True,
-            capture_output=True,
-            timeout=limit + START_TIME,
-            check=True,
-        )
-    except subprocess.TimeoutExpired:
-        return {}
-    except subprocess.CalledProcessError as error:
-        click.echo(f"{stages[0][0]}: {error.stderr.strip().splitlines()[-1:]}", err=True)
-        return {}
-    measured: dict[str, Any] = json.loads(done.stdout)
-    return measured
+WORKER = Path(__file__).with_name("scale_worker.py")
 
 
 def run_siconos(
@@ -194,11 +128,15 @@ def measure(
             allowed = limit
             if name in CONTESTANTS and auto is not None and auto["solved"]:
                 allowed = min(limit, max(MIN_LIMIT, MAX_SLOWDOWN * auto["time"]))
-            load_per_core = os.getloadavg()[0] / (os.cpu_count() or 1)
-            found = run_worker(python, folder, path, stages, allowed * max(1.0, load_per_core), tol)
-            if found:
+            allowed *= max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+            Path(f"{path}.npy").unlink(missing_ok=True)
+            with closing(Checkout(folder, WORKER, python)) as worker:
+                task = "solve_stages", str(path), stages, allowed, tol
+                found = worker.ask(*task, limit=allowed + START_TIME)
+            if "status" not in found:
                 found["residual"] = float(lv.residual(problem, np.load(f"{path}.npy")).relative)
             else:
+                click.echo(f"{name}: {found['status']}", err=True)
                 found = {
                     "time": math.nan,
                     "memory": math.nan,

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import click
@@ -26,6 +25,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown, out_option, write_json
+from benchmarks.pairs import run_timed, time_alternately
 
 SIZES = ((4, 18), (10, 36))  # Contacts and velocities of random worlds.
 LAWS = ("coulomb", "cone")
@@ -56,13 +56,8 @@ Rows = Iterator[dict[str, Any]]
 
 def measure(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Return the smallest CPU time [s] of each call; the calls alternate."""
-    best = dict.fromkeys(calls, np.inf)
-    for _ in range(repeats):
-        for name, call in calls.items():
-            begin = process_time()
-            call()
-            best[name] = min(best[name], process_time() - begin)
-    return best
+    times = time_alternately(*calls.values(), rounds=repeats, before=int)
+    return dict(zip(calls, times.min(axis=0).tolist(), strict=True))
 
 
 def describe(name: str, best: dict[str, float], worlds: int, first: str = "cold") -> dict[str, Any]:
@@ -130,11 +125,10 @@ def list_singles(worlds: int, repeats: int) -> Rows:
                 for name, of, given in zip(
                     best, (after, after, batch), (None, start, start), strict=True
                 ):
-                    problems = list(of)
-                    begin = process_time()
-                    for i, problem in enumerate(problems):
-                        lv.solve(problem, impulse=None if given is None else given[i])
-                    best[name] = min(best[name], process_time() - begin)
+                    starts = [None] * n if given is None else given
+                    both = list(zip(of, starts, strict=True))
+                    solves = partial(list, (lv.solve(p, impulse=x) for p, x in both))
+                    best[name] = min(best[name], run_timed(solves)[1])
             yield describe(f"{3 * contacts} rows, {nv} velocities, {law}", best, n)
 
 
@@ -232,6 +226,15 @@ def list_motions(worlds: int, repeats: int) -> Rows:
         yield describe(name, measure(calls, repeats), STEPS, "solve")
 
 
+def step_worlds(model: Any, datas: list[Any], states: np.ndarray) -> None:
+    """Step each world and copy its state."""
+    import mujoco
+
+    for data, state in zip(datas, states, strict=True):
+        mujoco.mj_step(model, data)
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
 def list_loops(worlds: int, repeats: int) -> Rows:
     """Yield the sheet `loop`: every world is stepped, imported, judged and solved, without or with starts."""
     import mujoco
@@ -248,19 +251,15 @@ def list_loops(worlds: int, repeats: int) -> Rows:
         times = dict.fromkeys(("loop", "step", "import", "judge", "solve"), 0.0)
         solutions = None
         for _ in range(STEPS):
-            clock = [process_time()]
-            for data, state in zip(datas, states, strict=True):
-                mujoco.mj_step(model, data)
-                mujoco.mj_getState(model, data, state, kind)
-            clock.append(process_time())
-            batch, answer = lv.io.from_mujoco_many(model, states, scratch=scratch)
-            clock.append(process_time())
-            lv.residual_many(batch, answer)
-            clock.append(process_time())
-            solutions = lv.solve_many(batch, impulse=solutions if is_warm else None)
-            clock.append(process_time())
-            parts = np.diff(clock)
-            for part, seconds in zip(times, (parts.sum(), *parts), strict=True):
+            start = solutions if is_warm else None
+            _, stepped = run_timed(partial(step_worlds, model, datas, states))
+            (batch, answer), read = run_timed(
+                partial(lv.io.from_mujoco_many, model, states, scratch=scratch)
+            )
+            _, judged = run_timed(partial(lv.residual_many, batch, answer))
+            solutions, solved = run_timed(partial(lv.solve_many, batch, impulse=start))
+            parts = stepped, read, judged, solved
+            for part, seconds in zip(times, (sum(parts), *parts), strict=True):
                 times[part] += seconds
         yield describe(name, times, worlds * STEPS, "loop")
 

@@ -16,12 +16,13 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from time import monotonic, process_time
+from time import monotonic
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
+from benchmarks.pairs import run_timed, time_call
 from benchmarks.peers.backend_time import measure_backend_time
 from lavender import registry
 from lavender.base.arrays import FloatArray
@@ -108,13 +109,10 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
             scaled = scaled.make_definite(0)
 
         def once(eps: float) -> tuple[float, FloatArray]:
-            begun = process_time()
-            with measure_backend_time(
-                backend.name if own else "", process_time, setup=True
-            ) as spent:
-                answer = backend.run(scaled, None, _limits(eps, backend.max_iter, limit), {})
-            seconds = sum(spent) if own else process_time() - begun
-            return seconds, _impulse(built, answer.x, answer.lam)
+            limits = _limits(eps, backend.max_iter, limit)
+            with measure_backend_time(backend.name if own else "") as spent:
+                answer, seconds = run_timed(lambda: backend.run(scaled, None, limits, {}))
+            return sum(spent) if own else seconds, _impulse(built, answer.x, answer.lam)
 
         untold = backend.call is None and backend.settings is None  # has a fixed tolerance
         for eps in LADDER[:1] if untold else LADDER:
@@ -191,9 +189,7 @@ def _cone(name: str, form: str) -> Contestant:
             )
 
         def once(eps: float) -> tuple[float, FloatArray]:
-            begun = process_time()
-            x, y = scs(eps) if name == "scs" else qoco(eps)
-            seconds = process_time() - begun
+            (x, y), seconds = run_timed(functools.partial(scs if name == "scs" else qoco, eps))
             return seconds, _impulse(built, np.asarray(x), np.asarray(y, float))
 
         for eps in LADDER:
@@ -247,12 +243,13 @@ def _pinocchio(lanczos: int | None) -> Contestant:
             settings.solve_ncp = problem.law == "coulomb"
             if lanczos is not None:
                 settings.lanczos_size = lanczos
-            start = process_time()
             result = pin.ADMMSolverResult()
-            pin.ADMMConstraintSolver(m).solve(
-                pin.DelassusOperatorSparse(a), g, models, datas, settings, result
-            )
-            seconds = process_time() - start
+
+            def solve() -> None:
+                matrix = pin.DelassusOperatorSparse(a)
+                pin.ADMMConstraintSolver(m).solve(matrix, g, models, datas, settings, result)
+
+            seconds = time_call(solve)
             x = np.empty(m)
             x[order] = np.asarray(result.retrieveConstraintImpulses()).ravel()
             return seconds, x * (speed / unit)
@@ -292,9 +289,10 @@ def _scipy(name: str) -> Contestant:
             return solveh_banded(band, problem.b)
 
         def once() -> tuple[float, FloatArray]:
-            start = process_time()
-            x = banded() if name == "banded" else spsolve(a, problem.b)
-            return process_time() - start, np.asarray(x)
+            x, seconds = run_timed(
+                banded if name == "banded" else functools.partial(spsolve, a, problem.b)
+            )
+            return seconds, np.asarray(x)
 
         yield once
 
@@ -474,16 +472,12 @@ def _ours(name: str, scratch: bool) -> Contestant:
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         def once(tol: float) -> tuple[float, FloatArray]:
             given = replace(problem, copy=False) if scratch else problem
-            start = process_time()
-            prepared = prepare(given, name)
-            seconds = process_time() - start
+            prepared, setup = run_timed(functools.partial(prepare, given, name))
             get_zero_impulse_reference(given)  # compute the judge's reference before timing
             first = given.start()
-            start = process_time()
-            impulse = prepared.solve(
-                impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit
-            ).impulse
-            return seconds + process_time() - start, impulse
+            limits = {"tol": tol, "max_iter": 2**31 - 1, "time_limit": limit}
+            solution, seconds = run_timed(lambda: prepared.solve(impulse=first, **limits))
+            return setup + seconds, solution.impulse
 
         if not scratch:
             get_zero_impulse_reference(problem)

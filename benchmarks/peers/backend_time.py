@@ -1,7 +1,6 @@
-"""Measure the time that a backend spends in its own solve during a call of `lv.solve`.
+"""Measure the CPU time that a backend spends in its own set-up and solve during a call of `lv.solve`.
 
-The class or function of the backend's own interface is wrapped while the call runs. For backends that set up and solve
-in one function (daqp, quadprog, scs), the time includes the set-up.
+The class or function of the backend's own interface is wrapped while the call runs.
 """
 
 from __future__ import annotations
@@ -9,8 +8,9 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from time import perf_counter
 from typing import Any
+
+from benchmarks.pairs import run_timed
 
 SETUP_METHODS = ("setup", "init")  # Methods of the backends' classes that receive the data.
 
@@ -53,23 +53,18 @@ class _TimedObject:
 
 @contextmanager
 def measure_backend_time(
-    solver: str, clock: Callable[[], float] = perf_counter, setup: bool = False
+    solver: str,
 ) -> Iterator[list[float]]:
-    """Yield a list that receives the time [s] of each call into the backend; it stays empty for unknown backends.
-
-    With `setup` the time includes the backend's set-up.
-    """
+    """Yield a list that receives the CPU time [s] of each set-up and solve of a backend."""
     spent: list[float] = []
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         """Wrap a function so that the time of each call is appended to `spent`."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
-            begun = clock()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                spent.append(clock() - begun)
+            result, seconds = run_timed(lambda: function(*args, **kwargs))
+            spent.append(seconds)
+            return result
 
         return call
 
@@ -83,8 +78,8 @@ def measure_backend_time(
             def make_timed(
                 *args: Any, original: Any = original, method: str = method, **kwargs: Any
             ) -> Any:
-                make, more = (timed(original), SETUP_METHODS) if setup else (original, ())
-                return _TimedObject(make(*args, **kwargs), (method, *more), timed)
+                made = timed(original)(*args, **kwargs)
+                return _TimedObject(made, (method, *SETUP_METHODS), timed)
 
             stack.callback(setattr, module, name, original)
             setattr(module, name, make_timed if method else timed(original))

@@ -11,13 +11,14 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
-from time import process_time
 
 import numpy as np
 
 from benchmarks.output import markdown
+from benchmarks.pairs import run_timed
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.sim.engine import Simulation
@@ -143,9 +144,8 @@ class Lavender:
 
     def run(self, steps: int) -> tuple[float, FloatArray]:
         """Do steps; return their CPU time [s] and the centres (n, 3) [m]."""
-        start = process_time()
-        observation = self.simulation.run(steps)[0]
-        return process_time() - start, observation["positions"][1:]
+        (observation, *_), seconds = run_timed(partial(self.simulation.run, steps))
+        return seconds, observation["positions"][1:]
 
 
 def measure(program: Path, scene: str, rounds: int = 5) -> Beside:

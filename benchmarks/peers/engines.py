@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from time import process_time
 from typing import Any
 
 import numpy as np
 
 from benchmarks import stand
 from benchmarks.engines import create_engine, get_missing_installation_command
+from benchmarks.pairs import time_call
 from benchmarks.stand import Contestant, Tower
 from lavender.base.errors import UnknownName
 from lavender.problem import Problem
@@ -138,25 +138,21 @@ def measure_scene(
             stack.callback(made[-1].close)
         size = np.ones(len(made), int)
         for i, stepping in enumerate(made):
-            start = process_time()
+            spent = 0.0
             for done in range(settle):
-                stepping.step()
-                if process_time() - start > SETTLE_LIMIT:
+                spent += time_call(stepping.step)
+                if spent > SETTLE_LIMIT:
                     notes[i] = (
                         f"did not settle: {done + 1} of {settle} steps in {SETTLE_LIMIT:g} s of CPU"
                     )
                     break
-            size[i] = max(
-                1, min(200, int(BATCH / max((process_time() - start) / max(settle, 1), 1e-6)))
-            )
+            size[i] = max(1, min(200, int(BATCH / max(spent / max(settle, 1), 1e-6))))
         best = np.full(len(made), np.inf)
         for _ in range(rounds):
             for i, stepping in enumerate(made):
-                if i in notes:
-                    continue
-                start = process_time()
-                stepping.advance(size[i])
-                best[i] = min(best[i], (process_time() - start) / size[i])
+                if i not in notes:
+                    taken = time_call(partial(stepping.advance, size[i]))
+                    best[i] = min(best[i], taken / size[i])
         found = []
         for i, (one, stepping) in enumerate(zip(known, made, strict=True)):
             name = f"{one.name}, {sweeps} sweeps" if one.sweeps else one.name
