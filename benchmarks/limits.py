@@ -1,17 +1,18 @@
 """Calls under a time limit, on drawn problems: answers and times.
 
-    python -m benchmarks limits [--sheet auto|prepared|programs] [--count 400] [--seed 0] [--solver clarabel ...]
+    python -m benchmarks limits [--sheet auto|prepared|programs] [--count 100] [--seed 0] [--solver clarabel ...]
 
-The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same limit: structures of 60 to
-4,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time of prepared
-solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms. The sheet
-`programs` prints for each solver in which share of quadratic programs of 5 to 1,000 variables the CPU time of
+Problems are those of `regret`. The sheet `auto` divides the residual of `auto` by that of the best sweeps with the same
+limit: 60 to 3,000 rows, limits of 0.1 to 10 ms, from zero or a stale start. The sheet `prepared` compares the CPU time
+of prepared solves of every own solver, 300 to 3,000 rows, limits L of 1 to 50 ms, with 2 L + 5 ms and 2 L + 25 ms.
+The sheet `programs` prints for each solver in which share of quadratic programs of 5 to 1,000 variables the CPU time of
 `solve_qp`, without the time inside of the backend's package and imports, is at most the limit plus OVERHEAD.
 """
 
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 from functools import partial
 from time import thread_time
 from typing import Any
@@ -22,12 +23,12 @@ import scipy.sparse as sp
 
 import lavender as lv
 import lavender.solving.loop
-from benchmarks.core_problems import forms, fresh, lattice_pile, stacks
+from benchmarks.core_problems import forms, fresh, stacks
 from benchmarks.output import markdown
 from benchmarks.pairs import run_timed
 from benchmarks.peers.backend_time import measure_backend_time
-from benchmarks.scale_structures import STRUCTURES, build
-from lavender import registry, suite
+from benchmarks.random_families import draw_problems
+from lavender import registry
 from lavender.problem import Problem
 from lavender.solvers.registry import get
 from lavender_ext.core.deadline import play_clock
@@ -41,15 +42,8 @@ SHEET_SWEEPS = (
     "nncg",
     "anderson",
 )  # Four accept each problem.
-KINDS = {
-    "structure": 0.45,
-    "columns": 0.2,
-    "lattice": 0.1,
-    "granular": 0.1,
-    "chain": 0.1,
-    "dense": 0.05,
-}
-FORM_NAMES = ("bodies", "matrix", "J and M")
+MAX_ROWS = 3_000
+MIN_ROWS = {"auto": 60, "prepared": 300}
 TOLERANCE, REPEATS = 1e-6, 3
 
 Line = dict[str, Any]
@@ -165,70 +159,8 @@ def measure_programs(count: int, solvers: tuple[str, ...]) -> list[list[Any]]:
 # -- sheets of drawn contact problems ------------------------------------------------------------------
 
 
-def draw_dense_matrix(rng: np.random.Generator, m: int, shift: float) -> Problem:
-    """Draw contacts of three rows of a full A (m, m) with the least eigenvalue `shift`."""
-    half = rng.normal(size=(m, m // 2))
-    return Problem.contact(half @ half.T / m + shift * np.eye(m), rng.normal(size=m), 0.5)
-
-
-def draw_dense_jacobian(rng: np.random.Generator, m: int, n: int, density: float = 1.0) -> Problem:
-    """Draw contacts of three rows of J (m, n) with this fraction of entries, and a full M."""
-    half = rng.normal(size=(n, n))
-    jac = rng.normal(size=(m, n))
-    free = rng.normal(size=n)
-    if density < 1.0:
-        jac *= rng.random((m, n)) < density
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
-    return Problem.from_jacobian(jac, half @ half.T / n + np.eye(n), free, cones=cones)
-
-
-def draw_bodies(rng: np.random.Generator, kind: str, rows: int) -> tuple[str, Problem]:
-    """Draw a structure of bodies of about so many rows; return its name and the problem."""
-    seed = int(rng.integers(1000))
-    if kind == "structure":
-        name = str(rng.choice(list(STRUCTURES)))
-        return name, build(
-            name, rows, float(rng.choice([0.0, 0.3])), float(rng.choice([0.0, 1.0])), seed
-        )
-    if kind == "columns":
-        height = int(rng.integers(1, 30))
-        mu = None if rng.random() < 0.25 else 0.5
-        return kind, stacks(
-            max(1, rows // ((4 if mu is None else 12) * height)), height, mu, False, seed=seed
-        )
-    if kind == "lattice":
-        return kind, lattice_pile(max(20, rows // 3), shuffle=rng.random() < 0.5, seed=seed)
-    if kind == "granular":
-        size = max(2, round((rows / 8) ** (1 / 3)))
-        return kind, suite.granular(n=size, friction="coulomb", seed=seed).problem
-    return kind, suite.chain(n=max(20, rows // 3), tip_mass=float(10 ** rng.uniform(-1, 3))).problem
-
-
-def convert(rng: np.random.Generator, problem: Problem, form: str) -> Problem:
-    """Return the problem in this form, one of four contact problems under the cone law."""
-    if problem.rows is not None and form != "bodies" and problem.rows.inv_mass.all():
-        problem = forms(problem)[form]
-    return problem.relaxed("cone") if problem.law == "coulomb" and rng.random() < 0.25 else problem
-
-
-def draw_call(k: int, seed: int) -> tuple[str, Problem, Any, float]:
-    """Draw (name, problem, start or None, limit [s]) of a line of the sheet `auto`."""
-    rng = np.random.default_rng([seed, k])
-    rows = round(np.exp(rng.uniform(np.log(60), np.log(4000))))
-    kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
-    form = str(rng.choice(FORM_NAMES, p=[0.6, 0.2, 0.2]))
-    if kind == "dense":
-        m = 3 * (min(rows, 600) // 3)
-        is_matrix = rng.random() < 0.5
-        name = "dense A" if is_matrix else "dense J and M"
-        given = (
-            draw_dense_matrix(rng, m, 0.01)
-            if is_matrix
-            else draw_dense_jacobian(rng, m, max(12, m // 4))
-        )
-    else:
-        name, given = draw_bodies(rng, kind, rows)
-    problem = convert(rng, given, form)
+def draw_call(problem: Problem, rng: np.random.Generator) -> tuple[Any, float]:
+    """Draw (start or None, limit [s]) of a line of the sheet `auto`."""
     start = None
     if rng.random() < 0.67:
         noise = 0.3 * problem.b * rng.standard_normal(problem.m)
@@ -238,17 +170,12 @@ def draw_call(k: int, seed: int) -> tuple[str, Problem, Any, float]:
         sweeps = next(name for name in SHEET_SWEEPS if not get(name).refuses(problem))
         stale = lv.solve(other, sweeps, max_iter=int(rng.integers(5, 60)), tol=0.0).impulse
         start = float(rng.choice([1.0, 1.0, 3.0])) * stale
-    return (
-        f"{name}, {form}, {problem.law}",
-        problem,
-        start,
-        float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))),
-    )
+    return start, float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-2))))
 
 
-def measure_auto(k: int, seed: int) -> Line:
+def measure_auto(problem: Problem, rng: np.random.Generator) -> list[Line]:
     """Measure a line of the sheet `auto`."""
-    name, problem, start, limit = draw_call(k, seed)
+    start, limit = draw_call(problem, rng)
     names = [solver for solver in ("auto", *SHEET_SWEEPS) if not get(solver).refuses(problem)]
     runs = np.empty((REPEATS, len(names), 2))
     for i in range(REPEATS):
@@ -262,8 +189,8 @@ def measure_auto(k: int, seed: int) -> Line:
     at_start = lv.residual(problem, problem.start() if start is None else start).relative
     ratio = max(own, TOLERANCE) / max(others.min(), TOLERANCE)
     best = names[1 + int(others.argmin())]
-    return {
-        "name": name,
+    line = {
+        "name": problem.name,
         "rows": problem.m,
         "limit": limit,
         "residual": own,
@@ -273,6 +200,7 @@ def measure_auto(k: int, seed: int) -> Line:
         "ratio": ratio,
         "time": over,
     }
+    return [line]
 
 
 def print_auto(lines: list[Line], worst: int) -> None:
@@ -323,28 +251,8 @@ def print_auto(lines: list[Line], worst: int) -> None:
     )
 
 
-def measure_prepared(k: int, seed: int) -> list[Line]:
+def measure_prepared(problem: Problem, rng: np.random.Generator) -> list[Line]:
     """Measure the own solvers on a problem of the sheet `prepared`."""
-    rng = np.random.default_rng([seed, k, 1])
-    m = 3 * round(np.exp(rng.uniform(np.log(100), np.log(1000))))
-    name = (
-        "dense A",
-        "sparse A",
-        "bodies",
-        "dense J and M",
-        "sparse J and M",
-        "J and M of bodies",
-    )[k % 6]
-    if name == "dense A":
-        problem = draw_dense_matrix(rng, m, 0.05)
-    elif name.endswith("J and M"):
-        problem = draw_dense_jacobian(
-            rng, m, int(m / rng.uniform(0.8, 4.0)), 1.0 if name.startswith("dense") else 0.1
-        )
-    else:
-        kind = str(rng.choice(["structure", "columns"]))
-        form = {"sparse A": "matrix", "J and M of bodies": "J and M"}.get(name, "bodies")
-        problem = convert(rng, draw_bodies(rng, kind, m)[1], form)
     limit = float(np.exp(rng.uniform(np.log(1e-3), np.log(5e-2))))
     lines = []
     for solver, spec in registry.specs().items():
@@ -357,7 +265,7 @@ def measure_prepared(k: int, seed: int) -> list[Line]:
             solution, time = run_timed(call)
             lines.append(
                 {
-                    "name": f"{name}, {problem.law}",
+                    "name": problem.name,
                     "rows": problem.m,
                     "solver": solver,
                     "limit": limit,
@@ -414,9 +322,12 @@ def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
     lavender.solving.loop.perf_counter = thread_time  # type: ignore[attr-defined]
     gc.disable()
     lines: list[Line] = []
-    for k in range(count):
-        lines += [measure_auto(k, seed)] if sheet == "auto" else measure_prepared(k, seed)
-        gc.collect()
+    measure = measure_auto if sheet == "auto" else measure_prepared
+    for source, number, problem in draw_problems(seed, count, MAX_ROWS):
+        if problem.m >= MIN_ROWS[sheet]:
+            named = replace(problem, name=f"{source} {number} {problem.name}")
+            lines += measure(named, np.random.default_rng([number, 1]))
+            gc.collect()
     (print_auto if sheet == "auto" else print_prepared)(lines, worst)
 
 
@@ -428,7 +339,7 @@ def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:
     show_default=True,
 )
 @click.option("--solver", "solvers", multiple=True, default=("auto",), help="Of the programs.")
-@click.option("--count", default=400, show_default=True, help="Number of problems of a sheet.")
+@click.option("--count", default=100, show_default=True, help="Number of seeds, or of programs.")
 @click.option("--seed", default=0, show_default=True)
 def command(sheet: str, solvers: tuple[str, ...], count: int, seed: int) -> None:
     """Measure calls under time limits."""

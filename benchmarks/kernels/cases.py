@@ -35,7 +35,6 @@ class Row:
     beside: str = ""  # name of the bare loop that was timed alternately
     limit: float = float("nan")  # s, smallest CPU time of the bare loop
     residual: float = float("nan")  # -, relative residual of the result
-    instructions: float = float("nan")  # per unit of work
 
     @property
     def per_unit(self) -> float:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import click
 
 from benchmarks.kernels.cases import CASES, Row, run
-from benchmarks.kernels.instructions import COUNTED, instructions
 from benchmarks.output import markdown
 from lavender.report import machine
 
@@ -25,7 +23,6 @@ def table(rows: Sequence[Row]) -> str:
         "time",
         "unit",
         "ns / unit",
-        "instructions / unit",
         "beside",
         "share",
         "residual",
@@ -42,7 +39,6 @@ def table(rows: Sequence[Row]) -> str:
                 time,
                 r.unit,
                 f"{r.per_unit:.3g}",
-                _number(r.instructions),
                 beside,
                 _number(r.share, "{:.2f}"),
                 _number(r.residual, "{:.1e}"),
@@ -54,13 +50,7 @@ def table(rows: Sequence[Row]) -> str:
 @click.command("kernels")
 @click.argument("cases", nargs=-1, metavar="[CASES]...")
 @click.option("--seconds", default=0.2, show_default=True, metavar="S", help="Time for each case.")
-@click.option(
-    "--instructions",
-    "count",
-    is_flag=True,
-    help="Count instructions by valgrind's callgrind, minutes.",
-)
-def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
+def command(cases: tuple[str, ...], seconds: float) -> None:
     """Measure kernels and small calls alternately with bare loops of the same mathematics.
 
     CASES are names of cases; default: all.
@@ -70,8 +60,5 @@ def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
     list(run([name for name in cases if name not in CASES]))  # raises an error for an unknown name
     for name in cases or CASES:
         click.echo(name, err=True)
-        rows = list(run([name], seconds=seconds))
-        if count and name in COUNTED:
-            rows = [replace(r, instructions=instructions(name)) for r in rows]
-        found += rows
+        found += run([name], seconds=seconds)
     click.echo(table(found))
