@@ -155,14 +155,19 @@ class Auto(Solver):
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
         log = SolveLog(problem, tol, max_iter, deadline)
-        tree = DecisionTree(problem, deadline, log, state.first_stage)
-        tree.compiled_call_failed = bool(failed) and problem.generalized is not None
-        tree.started_from_zero = tree.compiled_call_failed and not (impulse - problem._start).any()
+        call_failed = bool(failed) and problem.generalized is not None
+        tree = DecisionTree(
+            problem,
+            deadline,
+            log,
+            state.first_stage,
+            call_failed=call_failed,
+            started_from_zero=call_failed and not (impulse - problem._start).any(),
+            has_swept=first is not None,
+        )
         log.start_from_better_impulse(impulse)
         log.recorder = recorder
         if first is not None:
-            tree.pace = 1.0
-            tree.has_swept = True
             log.record_stage(first.name, first.claim, first.before)
         try:
             if max_iter > 0 and log.best > tol and not log.done():
@@ -275,7 +280,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
             isinstance(other, Iterations) for other in tree.steps.values()
         )
         if is_sweeps and has_swept:
-            tree.remaining_cost += stage.cost
+            tree.give_back(stage)
             continue
         if log.deadline.is_set and not step.over and not tree.leaves_time(stage, step):
             is_late = is_sweeps or tree.has_swept
@@ -284,7 +289,7 @@ def solve(log: SolveLog, tree: DecisionTree) -> None:
                 break
             step.over = step.late = True
         if step.over or (isinstance(step, Sweeps) and step.is_hopeless(stage.least)):
-            tree.remaining_cost += stage.cost
+            tree.give_back(stage)
         else:
             step.least = stage.least
             step.run(stage.iterations)

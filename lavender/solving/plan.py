@@ -130,8 +130,8 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
         )
     problem = problem.disk  # Equal to the problem if it has no ellipses.
     get_zero_impulse_reference(problem)
-    tree, small = DecisionTree(problem), describe_small_call(problem)
-    tree.compiled_call_failed = problem.generalized is not None and bool(small)
+    small = describe_small_call(problem)
+    tree = DecisionTree(problem, call_failed=problem.generalized is not None and bool(small))
     stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
         rows=problem.m,

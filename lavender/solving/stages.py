@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count, islice
 from math import inf, nan
@@ -48,19 +49,32 @@ class DecisionTree:
     """The stages of `auto` for a problem, as an iterable, their steps, and the costs that it compares [ns].
 
     `log.best` is the smallest relative residual so far; without a log, no stage runs. Stages before `first_stage` have
-    run on a problem with more islands.
+    run on a problem with more islands. `call_failed`: the compiled call over velocities of J and M has failed, which
+    perhaps started from the zero impulse. `has_swept`: sweeps have had their share before the first stage.
     """
 
-    pace = DECISIONS.assumed_pace  # Time of counted work on this machine as a multiple of its cost.
-    has_swept = False  # Whether sweeps have had their share before the first stage.
-    compiled_call_failed = False  # Whether the compiled call over velocities of J and M has failed.
-    started_from_zero = False  # Whether that call started from the zero impulse.
-    remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
-    sweeps_failed = False  # Whether sweeps did not improve the residual in the alternation.
-
     def __init__(
-        self, problem: Problem, deadline: Deadline = NEVER, log: Any = None, first_stage: int = 1
+        self,
+        problem: Problem,
+        deadline: Deadline = NEVER,
+        log: Any = None,
+        first_stage: int = 1,
+        *,
+        call_failed: bool = False,
+        started_from_zero: bool = False,
+        has_swept: bool = False,
     ) -> None:
+        self.compiled_call_failed = call_failed
+        self.started_from_zero = started_from_zero
+        self.has_swept = has_swept
+        # Time of counted work on this machine as a multiple of its cost.
+        self.pace = 1.0 if has_swept else DECISIONS.assumed_pace
+        self.remaining_cost = 0.0  # [ns] Cost that the alternation may still use.
+        self.sweeps_failed = (
+            False  # Whether sweeps did not improve the residual in the alternation.
+        )
+        self.is_analysed = False  # Whether Newton's matrix has been analysed.
+        self._newton_state: NewtonState | None = None
         self.problem = problem
         self.law = problem.law
         self.deadline = deadline
@@ -104,16 +118,20 @@ class DecisionTree:
         relaxation = get_relaxation(self.problem)
         return float(make_solver("anderson", relaxation).estimate_iteration_cost(relaxation))
 
-    @cached_property
+    @property
     def newton_state(self) -> NewtonState | None:
         """Newton's method after its analysis; None if it refuses the problem, fails or would end after the deadline."""
-        if get("newton").refuses(self.problem) or not self.has_time("newton", self.min_newton_cost):
-            return None
-        try:
-            state: NewtonState = get("newton").load()().prepare(self.problem)
-        except BREAKDOWN:
-            return None
-        return state
+        if not self.is_analysed:
+            spec = get("newton")
+            if not spec.refuses(self.problem) and self.has_time("newton", self.min_newton_cost):
+                with suppress(*BREAKDOWN):
+                    self._newton_state = spec.load()().prepare(self.problem)
+            self.is_analysed = True
+        return self._newton_state
+
+    def give_back(self, stage: Stage) -> None:
+        """Let the alternation use the cost of a stage that does not run."""
+        self.remaining_cost += stage.cost
 
     @cached_property
     def has_cheap_newton(self) -> bool:
@@ -171,7 +189,7 @@ class DecisionTree:
         """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
         fits = self.deadline.fits
         needed = before + self.pace * cost
-        if name == "newton" and "newton_state" in vars(self):
+        if name == "newton" and self.is_analysed:
             return fits(needed)
         loose = get_loose_limit(self.problem)
         if fits(loose + needed):
@@ -187,7 +205,7 @@ class DecisionTree:
             if newton is not None and newton.over:
                 return not newton.late
             cost = min(stage.cost, DECISIONS.time_share * self.deadline.get_remaining_nanoseconds())
-            if "newton_state" not in vars(self):
+            if not self.is_analysed:
                 return self.has_time("newton", self.min_newton_cost, cost)
             return self.newton_state is not None and self.has_time("newton", self.newton, cost)
         if self.newton_state is not None and stage.solver.startswith("newton"):
