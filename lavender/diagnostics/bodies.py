@@ -115,7 +115,10 @@ def diagnose_geometry(p: Problem) -> Iterator[Diagnostic]:
 
 
 def _diagnose_coincident_contacts(p: Problem, r: Rows, size: FloatArray) -> Iterator[Diagnostic]:
-    """Yield diagnostics about contacts of a pair that are equal up to rounding, or opposite within 1 %."""
+    """Yield diagnostics about contacts of a pair that are equal up to rounding, or opposite within 1 %.
+
+    Equal contacts with an open gap, a target below 0, are none: points of distant faces may coincide.
+    """
     pair = np.sort(r.contact_body, axis=1)
     sign = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
     # Compare the arms on the body with the larger number, which is a moving body.
@@ -135,6 +138,9 @@ def _diagnose_coincident_contacts(p: Problem, r: Rows, size: FloatArray) -> Iter
         clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
         opposed += [i[clash], j[clash]]
     again = np.unique(np.concatenate(equal))
+    speed = p.jacobian @ r.v_free.ravel()
+    is_open = p.b + speed < -1e-12 * np.abs(speed).max(initial=0.0)
+    again = again[~is_open[p.cones.normal_rows][again]]
     if len(again):
         reason = f"{len(again)} contacts are at the position of another contact of the pair"
         yield make_diagnostic(p, "duplicate rows", reason, blocks[again])

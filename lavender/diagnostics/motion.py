@@ -16,8 +16,8 @@ from lavender.problem import Problem
 G = 9.81  # [m/s^2]
 # [m/s] A larger target would separate bodies by more than 6 cm in a step of 2 ms.
 MAX_SEPARATION_TARGET = 30.0
-# [m/s] A larger target would allow an approach of more than 2 m in a step of 2 ms.
-MAX_APPROACH_TARGET = 1000.0
+# [m/s] A larger target would allow an approach of more than 5 m in a step of 0.5 ms.
+MAX_APPROACH_TARGET = 10_000.0
 # [-] A smaller ratio of target to approach speed is not a bounce: dt is a factor too many.
 MIN_RESTITUTION = 0.05
 # [-] Coefficients of restitution that are computed from velocities differ by this.

@@ -11,6 +11,7 @@ from worked import after
 import lavender as lv
 from lavender import suite
 from lavender.judge.certificates import list_conflicting_blocks
+from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
 from lavender.solvers.certify import prove_relaxation_infeasible
 
 SCENES = {
@@ -50,6 +51,36 @@ def kinds(problem, impulse=None):
 
 def test_diagnose_of_the_suite_reports_nothing():
     assert [c.name for c in suite.cases("default") if lv.diagnose(c.problem)] == []
+
+
+#: Sizes of scenes of the gallery that have many bodies by default.
+FEW_BODIES = {"pyramid": {"base": 4}, "pile": {"n": 12}, "chain": {"n": 6}, "bridge": {"n": 5}}
+#: Margins [m] and steps [s] that a user may set.
+MARGINS_AND_STEPS = [
+    (0.0, 5e-4),
+    (0.01, 0.02),
+    (0.1, 1 / 120),
+    (0.3, 5e-3),
+    (1.0, 0.02),
+    (1.0, 5e-4),
+]
+
+
+@pytest.mark.parametrize("name", [*SCENES_OF_GALLERY])
+def test_diagnose_of_every_step_of_the_gallery_reports_nothing(name):
+    """Only the rows of the closed loop of four bars contradict each other."""
+    allowed = {"conflict"} if name == "four_bar" else set()
+    for margin, dt in MARGINS_AND_STEPS:
+        simulation = after(0, name, margin=margin, dt=dt, **FEW_BODIES.get(name, {}))
+        for step in range(40):
+            seen = simulation.step()[0]
+            if step % 13:
+                continue
+            problem = simulation.constraint_problem()
+            moving = [i for i, body in enumerate(simulation.scene.bodies) if not body.is_static]
+            velocity = seen["velocities"][moving]
+            found = lv.diagnose(problem, velocity=velocity)
+            assert {s.kind for s in found} <= allowed, (margin, dt, step, found)
 
 
 @pytest.mark.parametrize("name", ["stack", "pit"])
