@@ -170,14 +170,15 @@ cdef inline bint is_row_unmoved(const blocks_t* p, const int32_t* empty, int32_t
 
 
 cdef inline bint has_island_without_scale(const blocks_t* p, const int32_t* empty) noexcept nogil:
-    """Return whether (3) applies to a row with b = 0 that impulses move."""
+    """Return whether (3) applies to a row with b = 0, or to a contact whose normal has b = 0, that impulses move."""
     cdef int32_t a, i, island, k
     for island in range(p.islands.n if p.islands != NULL else 0):
         if p.islands.reference[2 * island] < 0.0:
             for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
                 i = p.islands.order[a]
-                for k in range(p.ptr[i], p.ptr[i + 1] if has_independent_rows(p, i) else p.ptr[i] + 1):
-                    if p.b[k] == 0.0 and not (empty != NULL and empty[k]):
+                for k in range(p.ptr[i], p.ptr[i + 1]):     # b of the normal is that of all rows of a contact.
+                    if (p.b[k if has_independent_rows(p, i) else p.ptr[i]] == 0.0
+                            and not (empty != NULL and empty[k])):
                         return True
     return False
 

@@ -47,6 +47,16 @@ cdef inline double relative_residual_of_unmoved_rows(const blocks_t* p, const in
     return min(worst, 1.0)
 
 
+cdef inline double ratio_to_row_terms(const blocks_t* p, int32_t k, double error) noexcept nogil:
+    """Return an error [m/s] relative to s_k; 0 if no impulse moves row k and b is 0: it is satisfied, whatever its impulse is.
+
+    Terms are computed if impulses move a row with b = 0 of an island without a scale (`has_island_without_scale`).
+    """
+    if p.islands != NULL and p.islands.terms == NULL and p.b[k] == 0.0:
+        return 0.0
+    return ratio_to_reference(error, get_row_terms(p, k))
+
+
 cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end,
                                              const double* e) noexcept nogil:
     """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end)."""
@@ -57,13 +67,13 @@ cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* o
         j = p.ptr[i]
         if has_independent_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                r = ratio_to_reference(p.d[k] * fabs(e[k]), get_row_terms(p, k))
+                r = ratio_to_row_terms(p, k, p.d[k] * fabs(e[k]))
                 worst = r if r > worst else worst
             continue
         s = 0.0
         for k in range(j, p.ptr[i + 1]):
             s += (p.d[k] * e[k]) * e[k]
-        r = ratio_to_reference(sqrt(p.d[j]) * sqrt(s), get_row_terms(p, j))
+        r = ratio_to_row_terms(p, j, sqrt(p.d[j]) * sqrt(s))
         worst = r if r > worst else worst
     return worst
 

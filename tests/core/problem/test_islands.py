@@ -271,6 +271,30 @@ def test_residual_row_that_no_impulse_moves_does_not_depend_on_other_rows(form):
         assert any(s.kind == "immovable" and s.blocks for s in lv.diagnose(problem))
 
 
+@pytest.mark.parametrize("form", ["A", "J and M", "bodies"])
+@pytest.mark.parametrize("b", [0.0, 0.3, 1e6])
+def test_residual_of_a_satisfied_row_that_no_impulse_moves_is_zero_whatever_its_impulse_is(b, form):
+    """It is its w that its bounds must allow; an impulse outside of them shows in the error of its row alone."""
+    problem = unmoved_row_beside(b, form, 0.0)
+    for impulse in (0.0, 2.0, -1.0, 1e6):
+        found = lv.residual(problem, [b, impulse])
+        assert found.relative <= 1e-12 and abs(found.error[1]) == max(0.0, -impulse)
+
+
+@pytest.mark.parametrize("b", [0.0, 0.3])
+def test_residual_of_tangents_that_move_under_a_normal_that_does_not_counts_their_impulse(b):
+    """The normal is satisfied, its friction is 0, and an impulse of 5 N s along the tangent moves the body."""
+    jac = np.zeros((4, 4))
+    jac[0, 0] = jac[2, 1] = jac[3, 2] = 1.0
+    low, high = [0.0, 0.0, -np.inf, -np.inf], [np.inf] * 4
+    cones = lv.Cones([0, 1, 4], [0, 1], low, high, [0.0, 0.5], [0.0, 0.0])
+    problem = lv.Problem.from_jacobian(
+        jac, np.eye(4), np.zeros(4), target=[b, 0.0, 0.0, 0.0], cones=cones
+    )
+    assert lv.residual(problem, [b, 0.0, 0.0, 0.0]).relative <= 1e-12
+    assert not lv.residual(problem, [b, 0.0, 5.0, 0.0]).relative <= 1.0
+
+
 def row_between_driven_bodies(speed, excess, lower, form):
     """A row between two bodies driven at `speed` and `speed` + `excess` [m/s], beside one that is solved."""
     rows = lv.Rows(
