@@ -328,7 +328,7 @@ NUMBERS = {
         max_size=5,
     ),
 )
-def test_snapshot_with_changed_arrays_is_rejected_or_stepped(name, how, steps, edits):
+def test_process_survives_a_snapshot_with_changed_arrays(name, how, steps, edits):
     """A changed state may compute anything, but it reads and writes only within its arrays."""
     simulation = after(steps, name, **GALLERY[name], **how | {"on_failure": "use"})
     shot = simulation.snapshot()

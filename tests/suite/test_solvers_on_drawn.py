@@ -64,5 +64,5 @@ def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed
     problem = wild(seed=seed).problem
     found = check(problem, solver, tol=1e-9)
     assert found.success
-    assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
+    assert found.work["shifts"] == 1
     assert registry.get(solver).small.call.solve(problem, None, 1e-9)[0] is not None

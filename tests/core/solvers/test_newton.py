@@ -352,9 +352,8 @@ def test_newton_jacobian_with_two_bounds_takes_few_steps(seed):
     cones = lv.Cones.bounded(-bound, bound)
     problem = lv.Problem.from_jacobian(jac, np.eye(60), rng.normal(size=60), cones=cones)
     solution = lv.solve(problem, "newton", tol=1e-9)
-    assert (
-        solution.success and solution.work["factorisations"] <= 6
-    )  # Exchanges over rows took 1 to 3.
+    # Exchanges over rows took 1 to 3; exchanges of single rows would take as many as there are rows.
+    assert solution.success and solution.work["factorisations"] < problem.m / 4
 
 
 @pytest.mark.parametrize("form", ["rows", "matrix"])
