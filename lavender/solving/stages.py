@@ -197,17 +197,9 @@ class DecisionTree:
         return fits(make_solver(name, self.problem).estimate_setup_cost(self.problem) + needed)
 
     def leaves_time(self, stage: Stage, step: Step) -> bool:
-        """Return whether a stage can end before the deadline, and sweeps leave time for a solver that factors."""
+        """Return whether a stage can end before the deadline; sweeps end by themselves after their share."""
         if stage.solver == "anderson":
-            newton = self.steps.get("newton")
-            if stage.position > 0:
-                return True
-            if newton is not None and newton.over:
-                return not newton.late
-            cost = min(stage.cost, DECISIONS.time_share * self.deadline.get_remaining_nanoseconds())
-            if not self.is_analysed:
-                return self.has_time("newton", self.min_newton_cost, cost)
-            return self.newton_state is not None and self.has_time("newton", self.newton, cost)
+            return True
         if self.newton_state is not None and stage.solver.startswith("newton"):
             return self.has_time("newton", self.newton_state.cost)
         if stage.solver == "direct":
