@@ -119,6 +119,9 @@ class Claim:
     judged : lavender_ext.judge.measure.Judged, optional
         Result of the judge for the returned impulse, if the solver called it. It is used only if it belongs to the
         problem and the impulse, bit for bit.
+    refutation : str
+        What shows that the claim is false: the residual of the solver's own impulse, or a solution where the solver
+        claims that there is none. A solver leaves it empty.
     """
 
     status: Status
@@ -130,6 +133,7 @@ class Claim:
     certificate: FloatArray | None = None
     stages: tuple[SolverStage, ...] = ()
     judged: Any = field(default=None, repr=False, compare=False)
+    refutation: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

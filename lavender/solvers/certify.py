@@ -262,24 +262,18 @@ def find_certificate_by_linear_program(problem: Problem, deadline: Deadline) -> 
 
 def check_infeasibility_claim(
     problem: Problem, claim: Claim, tol: float, deadline: Deadline
-) -> tuple[Claim, str]:
+) -> Claim:
     """Check the claim of another package's solver or of a plug-in that a problem has no solution.
 
-    If its certificate is not valid, `auto` searches for one.
-
-    Returns
-    -------
-    Claim
-        The claim, with the certificate of `auto` if that found one.
-    str
-        Description of the solution that `auto` found instead, or empty.
+    If its certificate is not valid, `auto` searches for one. The claim returned has this certificate, or the solution
+    that `auto` found instead as its refutation.
     """
     if _is_proof(problem, claim, tol, deadline):
-        return claim, ""
+        return claim
     spec = get("auto")
     left = deadline.get_remaining_seconds()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
-        return claim, ""
+        return claim
     solver = spec.load()()
     impulse = problem.start()
     own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
@@ -287,10 +281,12 @@ def check_infeasibility_claim(
         raise KeyboardInterrupt
     if _is_proof(problem, own_claim, tol, deadline):
         message = f"{claim.message}; auto found the certificate".removeprefix("; ")
-        return replace(claim, certificate=own_claim.certificate, message=message), ""
+        return replace(claim, certificate=own_claim.certificate, message=message)
     relative = measure_residual(problem, impulse, "float64").relative
+    if not relative <= tol:
+        return claim
     solution = f"auto found a solution to a relative residual of {relative:.1e}"
-    return claim, solution if relative <= tol else ""
+    return replace(claim, refutation=solution)
 
 
 def _is_proof(problem: Problem, claim: Claim, tol: float, deadline: Deadline) -> bool:

@@ -92,9 +92,6 @@ class FinishedRun(NamedTuple):
     solve_time: float = 0.0  # [s]
     history: History | None = None
     sweeps_per_decade: float = math.nan
-    # Empty unless the caller knows that the claim is false: it describes a solution that was found although the solver
-    # claims that none exists, or the residual of the solver's own impulse if that was replaced.
-    refutation: str = ""
     deadline: Deadline = NEVER  # Certificates are not polished after it.
 
 
@@ -206,7 +203,7 @@ def finish(run: FinishedRun) -> Solution:
         claim.status is TIME_LIMIT and not min(judged.relative, judged.float64_relative) <= tol
     )
     is_late = is_late and claim.certificate is None  # No rule changes this status.
-    if (is_met or is_late) and not run.refutation:
+    if (is_met or is_late) and not claim.refutation:
         # The other fields are computed when one of them is first read.
         late = make_residual, (problem, judged)
         rest = make_fields, (run, judged, is_late)
@@ -267,7 +264,7 @@ def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:
 
     Return the fields of the solution that depend on the comparison.
     """
-    problem, claim, tol, refutation = run.problem, run.claim, run.tol, run.refutation
+    problem, claim, tol, refutation = run.problem, run.claim, run.tol, run.claim.refutation
     status, message, relative = claim.status, claim.message, judged.relative
     for rule in RULES:
         if status in rule.claims and rule.applies(run, judged):

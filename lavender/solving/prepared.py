@@ -57,7 +57,6 @@ from lavender.judge.solution import (
     sum_work_counts,
 )
 from lavender.problem import Problem, check_problem
-from lavender.solvers.certify import check_infeasibility_claim
 from lavender.solvers.decisions import SMALL_ROWS
 from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
@@ -430,21 +429,18 @@ class Prepared:
     # -- the run ---------------------------------------------------------------------------------
 
     def _run(self, loop: Loop, setup: SetUp, max_iter: int, has_default_start: bool) -> Solution:
-        """Decide without the solver, or choose the start, run and select; then prove and finish."""
+        """Decide without the solver, or choose the start, run, select and solve feasible islands; then finish."""
         setup_time = self.setup_time
         self.setup_time = 0.0
         start = loop.impulse.copy()
-        refutation = ""
-        decided = self._decide_without_solver(loop, setup, max_iter)
-        if decided is None:
+        claim = self._decide_without_solver(loop, setup, max_iter)
+        if claim is None:
             self._choose_start(loop, setup, start, has_default_start)
             claim = loop.run(max_iter) if self.spec.resumable else loop.run_in_one_call(max_iter)
-            claim, refutation = self._select(loop, setup, claim, start)
-        else:
-            claim = decided
-        if claim.status is INFEASIBLE:
-            claim, refutation = self._prove(loop, claim, refutation, max_iter, decided is not None)
-        return self._finish(loop, claim, start, setup_time, refutation)
+            claim = self._select(loop, setup, claim, start)
+            if claim.certificate is not None and claim.status is INFEASIBLE and loop.tol > 0.0:
+                claim = self._solve_feasible_islands(loop, claim, max_iter)
+        return self._finish(loop, claim, start, setup_time)
 
     def _decide_without_solver(self, loop: Loop, setup: SetUp, max_iter: int) -> Claim | None:
         """Return the claim of a problem that no solver can or may solve; else None."""
@@ -476,30 +472,31 @@ class Prepared:
             changed = (begin != start) & (loop.impulse == start)
             loop.impulse[changed] = begin[changed]
 
-    def _select(
-        self, loop: Loop, setup: SetUp, claim: Claim, start: FloatArray
-    ) -> tuple[Claim, str]:
-        """Select the impulse to return, unless an own solver claims what the judge confirms."""
+    def _select(self, loop: Loop, setup: SetUp, claim: Claim, start: FloatArray) -> Claim:
+        """Select the best of result and start in each island, unless an own solver claims what the judge confirms.
+
+        `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
+        """
         is_confirmed = not self.is_foreign and claim.status in (CONVERGED, ROUNDOFF_LIMIT)
-        if loop.tol > 0.0 and not is_confirmed:
-            return self._select_best_impulse(loop, claim, start, setup.checks_start)
-        return claim, ""
+        if loop.tol == 0.0 or is_confirmed:
+            return claim
+        problem = loop.problem
+        claim = name_lost_row(problem, loop.impulse, claim)
+        has_checks = setup.checks_start
+        keeps_best = self.spec.delegates and not problem.has_singular_program
+        checked = has_checks and loop.state.watch.has_best
+        if keeps_best or checked or (has_checks and claim.status is not TIME_LIMIT):
+            return claim
+        claimed = loop.impulse.copy()
+        loop.replace_by_best_impulse(start, claim)
+        if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
+            relative = measure_residual(problem, claimed).relative
+            if relative > loop.tol:
+                found = f"its own impulse has a relative residual of {relative:.2e}"
+                claim = replace(claim, refutation=found)
+        return claim
 
-    def _prove(
-        self, loop: Loop, claim: Claim, refutation: str, max_iter: int, is_decided: bool
-    ) -> tuple[Claim, str]:
-        """Check the claim of INFEASIBLE of a foreign solver, and solve the islands that the proof does not concern."""
-        if self.is_foreign:
-            claim, refutation = check_infeasibility_claim(
-                loop.problem, claim, loop.tol, loop.deadline or NEVER
-            )
-        if claim.certificate is not None and loop.tol > 0.0 and not is_decided:
-            claim = self._solve_feasible_islands(loop, claim, max_iter)
-        return claim, refutation
-
-    def _finish(
-        self, loop: Loop, claim: Claim, start: FloatArray, setup_time: float, refutation: str
-    ) -> Solution:
+    def _finish(self, loop: Loop, claim: Claim, start: FloatArray, setup_time: float) -> Solution:
         """Build the solution: the judge's residual, the status, the message."""
         if claim.judged is not loop.judged:
             claim = replace(claim, judged=loop.judged)
@@ -516,32 +513,9 @@ class Prepared:
                 solve_time=loop.time,
                 history=None if loop.records is None else loop.get_history(),
                 sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)),
-                refutation=refutation,
                 deadline=loop.deadline or NEVER,
             )
         )
-
-    def _select_best_impulse(
-        self, loop: Loop, claim: Claim, start: FloatArray, has_checks: bool
-    ) -> tuple[Claim, str]:
-        """Select the best of result and start in each island; return the claim and what refutes it, or an empty text.
-
-        `auto` and the checks of sweeps have stored the best impulse of each island, including the start.
-        """
-        spec = self.spec
-        problem = loop.problem
-        refutation = ""
-        claim = name_lost_row(problem, loop.impulse, claim)
-        keeps_best = spec.delegates and not problem.has_singular_program
-        checked = has_checks and loop.state.watch.has_best
-        if not keeps_best and not checked and (claim.status is TIME_LIMIT or not has_checks):
-            claimed = loop.impulse.copy()
-            loop.replace_by_best_impulse(start, claim)
-            if claim.status is CONVERGED and not np.array_equal(claimed, loop.impulse):
-                relative = measure_residual(problem, claimed).relative
-                if relative > loop.tol:
-                    refutation = f"its own impulse has a relative residual of {relative:.2e}"
-        return claim, refutation
 
     def _solve_feasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
         """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
@@ -653,11 +627,11 @@ def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
         raise InputError(
             f"solver {spec.name!r} cannot take the options {options}: {error}"
         ) from error
-    if not spec.builtin:
+    if spec.external or not spec.builtin:
         # Import the adapters of other packages only here, because they take a quarter of the time of `import lavender`.
         from lavender.solvers.foreign import ForeignSolver
 
-        return ForeignSolver(spec.name, solver)
+        return ForeignSolver(spec, solver)
     if spec.box_friction_laws <= spec.laws:
         return solver
     # Import this module here, because it imports the table of solvers.
