@@ -34,7 +34,11 @@ extensions = [
     "sphinx_reredirects",
 ]
 #: Former addresses of pages.
-redirects = {"chapter": "course/chapter.html", "chapter-answers": "course/answers.html"}
+redirects = {
+    "architecture": "guarantees.html",
+    "chapter": "course/chapter.html",
+    "chapter-answers": "course/answers.html",
+}
 exclude_patterns = ["_build"]
 default_role = "code"
 
@@ -70,9 +74,9 @@ CONTENTS = {
     "Solve": "choose solvers failures quadratic-programs",
     "Your data": "own-engine c formats derivatives",
     "Judge engines": "audit compare mujoco worlds engines read-a-step report commands scorecard scorecard-settings",
-    "LavenderSim and the course": "engine course/chapter course/answers generated/examples",
+    "LavenderSim and the course": "engine course/chapter course/answers course/lavendersim generated/examples",
     "Background": "residual methods comparison guarantees generated/cases generated/measured generated/engine-arrays",
-    "Project": "plugin architecture generated/api",
+    "Project": "plugin generated/api",
 }
 
 

@@ -83,30 +83,28 @@ ADVICE = (
 # Paragraphs of docs/solvers.md.
 INTRODUCTION = """\
 `lavender.solve` accepts these names. [How to choose a solver](choose.md) recommends one, and `lv.available(problem)`
-lists the solvers that accept a problem. The columns: *laws*, the [friction models](concepts.md#laws) that the solver
-accepts; *reads*, the forms of a problem that it reads (*rows*: body velocities, *generalized*: J and M, *matrix*: A,
-which is computed from the other forms); *exact*, a solver that ends after finitely many steps with the exact
-solution, up to rounding; *resumable*, a solver with the same bits after n₁ and then n₂ iterations as after n₁ + n₂."""
+lists the solvers that accept a problem. *Laws* are the [friction models](concepts.md#laws) that the solver accepts;
+it *reads* body velocities (*rows*), J and M (*generalized*), or A (*matrix*, computed from the other forms)."""
+KINDS = """\
+{exact} end after finitely many steps with the exact solution, up to rounding. All but {others} have the same bits after
+n₁ and then n₂ iterations as after n₁ + n₂."""
 BACKENDS_LISTED = """\
 A *backend* is a solver of another package. Backends accept the laws linear and lcp (`clarabel_cone` also cone), and
-read matrices and rows. The table shows results on small programs with known solutions, for each backend alone, at its
-default settings, in the given version. The programs are: the same row twice (*repeated*), dependent equalities
-(*dependent*), *contradictory* equalities, an *unbounded* objective, a *singular* P, an indefinite P that is convex on
-the rows (*convex on rows*), and an indefinite P with a *saddle*. *Start* names the arrays of a warm start that
-the backend uses. *Wrong* names programs that are reported as solved although the answer is wrong; *fails*
-names solvable programs without an answer."""
+read matrices and rows; [which one for your program](quadratic-programs.md#which-solver). The table shows results on
+small programs with known solutions, for each backend alone, at its default settings: the same row twice (*repeated*),
+*dependent* equalities, *contradictory* equalities, an *unbounded* objective, a *singular* P, an indefinite P that is
+*convex on rows*, and an indefinite P with a *saddle*. *Wrong* names programs that are reported as solved although the
+answer is wrong, *fails* solvable programs without an answer."""
 BACKENDS_CALLED = """\
 lavender judges every answer, so a wrong one is marked as a contradicted claim. It scales programs to numbers near 1,
 removes the error of the backend's tolerance by a Newton step, passes both triangles of P, and counts a claim of
 infeasibility only with a certificate. A start is passed to osqp, proxqp and daqp. `lavender solvers NAME` prints all
 observations of a backend and the measures against them. ECOS, OSQP and SCS replace the handler of Ctrl-C, so they run
-one solve at a time, also on several threads.
-
-Each backend takes these options:"""
+one solve at a time, also on several threads. Options:"""
 ORDERS = """\
-Options are keywords of `lavender.solve`. The option `order=` selects the [sweep order](sweep.md#sweep-orders),
-`seed=` the seed of random orders. If a problem is given as a matrix, `ground=` lists the blocks that touch the
-ground, from which `bottom_up` and `top_down` count their levels. These solvers accept all three options:"""
+Options are keywords of `lavender.solve`; `lavender solvers NAME` prints their meanings. Sweep solvers
+also take `order=`, the [sweep order](sweep.md#sweep-orders), `seed=` of random orders, and `ground=`, the blocks that
+touch the ground, from which `bottom_up` and `top_down` count their levels if a problem is given as a matrix."""
 LAW_NAMES = {
     "linear": "linear systems",
     "lcp": "bounded rows and contacts without friction",
@@ -352,38 +350,44 @@ def _module_of(spec):
     return function.__module__
 
 
+def join_names(specs):
+    """Return the names of solvers as text."""
+    *first, last = (f"`{spec.name}`" for spec in specs)
+    return f"{', '.join(first)} and {last}"
+
+
 def solver_overview():
     """Return the text of docs/solvers.md: a table of all solvers, and their options."""
     specs = built_in().values()
     rows = [
         (
             f"`{s.name}`",
-            join_laws(s),
-            ", ".join(sorted(s.operators)),
-            "yes" if s.exact else "",
-            "yes" if s.resumable else "",
+            "all" if set(s.laws) == set(LAWS) else join_laws(s),
+            "all" if len(s.operators) == 3 else ", ".join(sorted(s.operators)),
             s.summary,
         )
         for s in specs
         if not s.external
     ]
     own = [
-        (f"`{s.name}`", f"`{n}`", text)
+        (f"`{s.name}`", ", ".join(f"`{n}`" for n in s.options))
         for s in specs
-        if not s.external
-        for n, text in s.options.items()
+        if not s.external and s.options
     ]
     others = next(s for s in specs if s.external and s.options).options
-    takes_order = ", ".join(f"`{s.name}`" for s in specs if s.order)
     return "\n\n".join(
         (
             "# Solvers",
             "<!-- Written by `python docs/generate.py --pages`. -->",
             INTRODUCTION,
-            table(("name", "laws", "reads", "exact", "resumable", "method"), rows),
+            table(("name", "laws", "reads", "method"), rows),
+            KINDS.format(
+                exact=join_names(s for s in specs if not s.external and s.exact),
+                others=join_names(s for s in specs if not s.external and not s.resumable),
+            ),
             "## Options",
-            f"{ORDERS}\n{takes_order}.",
-            table(("solver", "option", "meaning"), own),
+            ORDERS,
+            "\n".join(f"- {name}: {options}" for name, options in own),
             "## Backends",
             BACKENDS_LISTED,
             tabulate_backends(s for s in specs if s.external),
@@ -394,7 +398,7 @@ def solver_overview():
 
 
 def tabulate_backends(specs):
-    """Return the table of backends: method, version, start, and the programs that a backend does not solve."""
+    """Return the table of backends, the programs that each does not solve, and the names without observations."""
     from lavender.programs import backends as b
 
     programs = (
@@ -409,11 +413,12 @@ def tabulate_backends(specs):
     solvable = "repeated", "dependent", "singular", "convex_on_rows"
     behaviours = {x.name: x.behaviour for x in b.BACKENDS}
     rows = []
+    unseen = []
     for spec in specs:
         method = spec.summary.removesuffix(" (QP backend)")
         seen = behaviours.get(spec.name)
         if seen is None:
-            rows.append((f"`{spec.name}`", method, "", "", "not observed"))
+            unseen.append(spec)
             continue
         wrong = [n.replace("_", " ") for n in programs if getattr(seen, n) == "wrong"]
         fails = [
@@ -423,12 +428,12 @@ def tabulate_backends(specs):
             (
                 f"`{spec.name}` {seen.version}",
                 method,
-                seen.start,
                 ", ".join(wrong),
                 ", ".join(fails),
             )
         )
-    return table(("backend", "method", "start", "wrong", "fails"), rows)
+    seen = table(("backend", "method", "wrong", "fails"), rows)
+    return f"{seen}\n\nNot observed: {join_names(unseen)}."
 
 
 # Paragraphs of the page of backends in the built documentation.

@@ -13,7 +13,6 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from worked import python
 
 import benchmarks.__main__ as benchmarks
 import lavender as lv
@@ -104,17 +103,6 @@ def test_python_of_a_page_runs(page, files, capsys):
             run_session(text, names, where)
         else:
             exec(compile("\n" * (line - 1) + text, str(page), "exec"), names)
-
-
-def test_the_test_of_the_page_on_plug_ins_passes_as_a_file_of_its_own(tmp_path):
-    python_blocks = [text for *_, text in blocks(ROOT / "docs" / "plugin.md", "python")]
-    (text,) = (text for text in python_blocks if "import pytest" in text and "cross_check" in text)
-    path = tmp_path / "test_mine.py"
-    path.write_text(text, encoding="utf-8")
-    assert (
-        "6 passed"
-        in python("-m", "pytest", "-q", "-p", "no:cacheprovider", path, cwd=tmp_path).stdout
-    )
 
 
 @pytest.mark.parametrize("name", list(modules_with_doctests()))

@@ -60,13 +60,13 @@ def test_readme_of_kernels_lists_packages_in_order_and_files_that_exist():
     assert [path for path in paths if "NAME" not in path and not (ROOT / path).exists()] == []
 
 
-def test_architecture_page_lists_layers_in_the_order_of_their_contract():
+def test_contributing_lists_layers_in_the_order_of_their_contract():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
         "importlinter"
     ]
     (layers,) = (c["layers"] for c in settings["contracts"] if c.get("containers") == ["lavender"])
     above = layers[layers.index("cli") : layers.index("io") + 1]
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = page[page.index("## Layers") : page.index("## Data flow")]
+    page = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = page[page.index("### Layers") : page.index("### Data flow")]
     listed = re.findall(r"^\| `([\w.]+)`", table, re.MULTILINE)
     assert listed == [*(f"lavender.{layer}" for layer in above), "lavender"]

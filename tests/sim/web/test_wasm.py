@@ -99,7 +99,7 @@ def test_page_scenes_are_the_start_of_native_ones():
 
 @needs_compiler
 def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
-    """Run each preset with the page's modules; compare with engine.md and course/answers.md."""
+    """Run each preset with the page's modules; compare with the pages of the course."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
@@ -108,7 +108,7 @@ def test_presets_of_the_page_have_the_results_of_the_documentation(tmp_path):
         [node, HERE / "preset_results.mjs", tmp_path], check=True, capture_output=True, text=True
     )
     results = json.loads(output.stdout)
-    page = (ROOT / "docs" / "engine.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "course" / "lavendersim.md").read_text(encoding="utf-8")
     presets = json.loads(PRESETS_PATH.read_text(encoding="utf-8"))["presets"]
     for preset in presets:
         if captions := results[preset["name"]]["captions"]:
