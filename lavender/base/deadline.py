@@ -48,6 +48,18 @@ def limit_forming(deadline: Deadline | None) -> Iterator[None]:
         FORMING.deadline = before
 
 
+@contextmanager
+def stop_clock(deadline: Deadline) -> Iterator[list[float]]:
+    """Leave the time of the block, of imports and processes, out of the limit; yield a list that receives it [s]."""
+    spent = [0.0]
+    begun = read_clock()
+    try:
+        yield spent
+    finally:
+        spent[0] = read_clock() - begun
+        deadline.extend(spent[0])
+
+
 def format_seconds(t: float) -> str:
     """Format a time [s] with three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline, read_clock
+from lavender.base.deadline import Deadline, stop_clock
 from lavender.base.lazy_import import import_module_under_lock
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof, prove_infeasibility
@@ -266,11 +266,8 @@ def _solve_linear_program(
     at_least: Any = 0.0,
 ) -> FloatArray | None:
     """Minimise cost.x with equations x = equal_to, inequalities x >= at_least and bounds; None without a point."""
-    begin = read_clock()
-    linprog = import_module_under_lock(
-        "scipy.optimize"
-    ).linprog  # It takes 0.1 s, and is seldom needed.
-    deadline.extend(read_clock() - begin)
+    with stop_clock(deadline):  # It takes 0.1 s, and is seldom needed.
+        linprog = import_module_under_lock("scipy.optimize").linprog
     n = len(cost)
     options: dict[str, Any] = {
         "primal_feasibility_tolerance": 1e-10,

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from time import perf_counter
 from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_bool
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, stop_clock
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.certificates import check_certificate
@@ -97,9 +96,8 @@ class QPSolver(Solver):
         program = get_program(qp)
         self._check_size(program)
         if deadline.is_set:
-            begin = perf_counter()
-            self.start_workers(None, 0.0)
-            deadline.extend(perf_counter() - begin)
+            with stop_clock(deadline):
+                self.start_workers(None, 0.0)
         judge = ProgramJudge(program, tol, deadline)
         # Without a limit of the user, a second call has as many iterations as the first one.
         budget = 2 * self.backend.max_iter if max_iter is None else max_iter

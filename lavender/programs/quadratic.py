@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, check_float, mark_read_only
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import Deadline, stop_clock
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof
@@ -185,10 +185,9 @@ class _SolveTask(ProgramTask):
             return self._make_answer(begun)
         if self.spec.delegates and self.deadline.is_set:
             # Later steps would import packages within the limit.
-            begin = perf_counter()
-            for backend in program_backends():
-                backend.load()().start_workers(None, 0.0)
-            self.deadline.extend(perf_counter() - begin)
+            with stop_clock(self.deadline):
+                for backend in program_backends():
+                    backend.load()().start_workers(None, 0.0)
         for step in self._list_steps():
             step()
             if self.is_over:

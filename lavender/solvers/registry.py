@@ -76,7 +76,11 @@ class SolverOptions(TypedDict, total=False):
 
 
 class State(Protocol):
-    """State of one solve, as `Solver.prepare` returns it. Both attributes are optional, for resumable solvers."""
+    """State of one solve, as `Solver.prepare` returns it. All attributes are optional, for resumable solvers.
+
+    A state with a `StoppingTest` as its attribute `watch` leaves the best iterate to it: `watch.keep_best(impulse,
+    tol)`, or the state's own `keep_best` if its rows have another order, writes the best impulse of each island.
+    """
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:  # pyright: ignore[reportReturnType]
@@ -102,6 +106,10 @@ class Solver:
 
     #: Whether the stopping test of a prepared state checks the start, so that no result is worse than the start.
     checks_start: ClassVar[bool] = True
+    #: Whether a failed run returns its last iterate under Coulomb's law (`lavender_ext/judge/best.pxd`).
+    keeps_last: ClassVar[bool] = False
+    #: Modules that a solve may import; under a time limit before its clock starts.
+    lazy_modules: ClassVar[tuple[str, ...]] = ()
 
     def prepare(self, problem: Problem) -> Any:
         """Build the state of a solve: factor, colour, allocate."""
@@ -123,11 +131,6 @@ class Solver:
         `time_limit` is None.
         """
         raise NotImplementedError
-
-    # Modules that a solve may import; under a time limit before its clock starts.
-    lazy_modules: tuple[str, ...] = ()
-    # Whether a failed run returns its last iterate under Coulomb's law (`lavender_ext/judge/best.pxd`).
-    keeps_last = False
 
     def estimate_setup_cost(self, problem: Problem) -> float:
         """Estimate the cost of `prepare` [ns]; under a time limit, `auto` starts a solver only if this cost fits."""
@@ -401,6 +404,11 @@ class SolverSpec:
             other is not None and problem.law not in self.laws and other.refuses(problem) is None
         )
         return other if bounds else None
+
+    @property
+    def lazy_modules(self) -> tuple[str, ...]:
+        """Modules that a solve may import, as the factory names them."""
+        return getattr(self.load(), "lazy_modules", ())
 
     def load(self) -> Callable[..., Solver]:
         """Return the factory; import it if necessary.

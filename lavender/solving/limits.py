@@ -44,7 +44,6 @@ def make_deadline(spec: SolverSpec, limit: float, begun: float) -> Deadline:
         spec.load()
         import_numerical_modules(*(() if spec.external else spec.requires))
     else:
-        modules: tuple[str, ...] = getattr(spec.load(), "lazy_modules", ())
-        if modules:
-            import_numerical_modules(*modules)
+        if spec.lazy_modules:
+            import_numerical_modules(*spec.lazy_modules)
     return Deadline(limit, begun + read_clock() - begin)

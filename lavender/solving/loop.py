@@ -54,6 +54,12 @@ BOUND_ROUNDING = 1e-12
 EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 
 
+def get_stopping_test(state: Any) -> StoppingTest | None:
+    """Return the stopping test of a solver's state, which keeps the best iterates; None if it has none."""
+    watch = getattr(state, "watch", None)
+    return watch if isinstance(watch, StoppingTest) else None
+
+
 @dataclass
 class Loop:
     """Loop around one solver's `run`, with chunks, clock, history and Ctrl-C."""
@@ -198,8 +204,8 @@ class Loop:
     def _keep_best(self, claim: Claim) -> None:
         """Replace the last iterate by the best checked iterate; a state's `best` that is no impulse does not count."""
         state: State = self.state
-        watch = getattr(state, "watch", None)
-        if isinstance(watch, StoppingTest):
+        watch = get_stopping_test(state)
+        if watch is not None:
             # Use the state's own method if it has one, because its rows may have another order than the problem's.
             getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)  # pyright: ignore[reportOptionalMemberAccess]
             return

@@ -27,7 +27,15 @@ from lavender.base.arrays import (
     check_int,
     mark_read_only,
 )
-from lavender.base.deadline import NEVER, UNLIMITED, Deadline, TooLate, limit_forming, read_clock
+from lavender.base.deadline import (
+    NEVER,
+    UNLIMITED,
+    Deadline,
+    TooLate,
+    limit_forming,
+    read_clock,
+    stop_clock,
+)
 from lavender.base.errors import (
     BREAKDOWN,
     CapabilityError,
@@ -63,10 +71,9 @@ from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, decide_empty_rows, finish, name_lost_row
 from lavender.solving.limits import check_time_limit, make_deadline, reserve_time_of_judge
-from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop
+from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop, get_stopping_test
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
-from lavender_ext.judge.stopping_test import StoppingTest
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -125,7 +132,7 @@ def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOpti
     # Form and factor all matrices that do not depend on b.
     if not problem.has_singular_program:
         if spec.builtin and not spec.external and problem.m > SMALL_ROWS:
-            import_numerical_modules(*getattr(spec.load(), "lazy_modules", ()))
+            import_numerical_modules(*spec.lazy_modules)
         with suppress(*BREAKDOWN):  # A solve repeats it and reports the error.
             get_zero_impulse_reference(problem.disk)
             if setup.solver is not None:
@@ -150,8 +157,7 @@ class SetUp:
     @property
     def checks_start(self) -> bool:
         """Whether the solver's stopping test judges the start, too, and keeps the best impulse of each island."""
-        is_test = type(getattr(self.state, "watch", None)) is StoppingTest
-        return is_test and bool(self.solver.checks_start)
+        return get_stopping_test(self.state) is not None and bool(self.solver.checks_start)
 
 
 class Prepared:
@@ -420,11 +426,9 @@ class Prepared:
     def _start_workers(self, setup: SetUp, deadline: Deadline) -> None:
         """Start the worker processes of a solver, without counting their start as time of the solve."""
         if self.spec.external or not self.spec.builtin or self.problem.has_singular_program:
-            begin = perf_counter()
-            setup.solver.start_workers(setup.state, deadline.get_remaining_seconds() or 0.0)
-            elapsed = perf_counter() - begin
-            deadline.extend(elapsed)
-            self.setup_time += elapsed
+            with stop_clock(deadline) as spent:
+                setup.solver.start_workers(setup.state, deadline.get_remaining_seconds() or 0.0)
+            self.setup_time += spent[0]
 
     # -- the run ---------------------------------------------------------------------------------
 
