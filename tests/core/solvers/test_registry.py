@@ -50,6 +50,25 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
     assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
+def test_processes_of_a_plug_in_start_outside_of_its_time_limit(register, clock):
+    class Slow:
+        def prepare(self, problem):
+            return problem
+
+        def start_workers(self, state, time_limit):
+            clock.now += 5.0
+
+        def run(self, state, impulse, n, tol, time_limit):
+            assert time_limit == 1.0
+            impulse[:] = state.b  # of A = 1
+            return lv.Claim(lv.Status.CONVERGED, 1)
+
+    register(named("slow", factory=Slow, resumable=False))
+    solution = lv.solve(TINY, "slow", time_limit=1.0)
+    assert solution.success
+    assert solution.setup_time >= 5.0
+
+
 def test_available_selects_by_capabilities():
     ordered = lv.available(law="lcp", order=True)
     assert "pgs" in ordered
