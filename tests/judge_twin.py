@@ -687,7 +687,8 @@ class Problem:
             if kind[k] != ROW:
                 size = np.sqrt(self.d[part][0] * (self.d[part] * error[part] ** 2).sum())[None]
             for x, y in zip(size, scale[part], strict=False):
-                worst = max(worst, ZERO if x == 0 else x / y if y > 0 else L(np.inf))
+                share = ZERO if x == 0 else x / y if y > 0 else L(np.inf)
+                worst = max(worst, share if kind[k] == ROW else min(share, L(1.0)))
         return worst
 
     def _rows_of(self, rows):

@@ -22,6 +22,7 @@ from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]
+BoolArray = npt.NDArray[np.bool_]
 #: Type of arguments: a number, nested sequences of numbers, or an array; docstrings give shape and unit.
 ArrayLike = npt.ArrayLike
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, overload
 
 import numpy as np
@@ -181,8 +182,6 @@ class Batch(Sequence[Problem]):
             mu, at["mu"], _ = _flatten("mu", mu, n, mu_shape, at["blocks"])
         self._arrays: Any = (jac, mass, free, goal, soft, mu)
         self.key = None if key is None else self._convert_keys(key)
-        # `lavender.io.engine_motion.EngineMotion` of worlds that an engine moves by accelerations.
-        self.engine_motions: dict[int, Any] = {}
 
     @classmethod
     def _from_valid_rows(
@@ -207,7 +206,6 @@ class Batch(Sequence[Problem]):
         batch._n = n
         batch.friction = "cone"
         batch.precision = "float64"
-        batch.engine_motions = {}
         batch.shape = target.shape
         batch.velocity_shape = (n * nv,)
         batch.cones = cones
@@ -234,6 +232,8 @@ class Batch(Sequence[Problem]):
         at["free"] = at["velocity"] = nv * np.arange(n)
         return batch
 
+    #: Motions of the worlds that an engine moves by accelerations, `lavender.io.engine_motion.EngineMotions`.
+    engine_motions: Any = MappingProxyType({})
     # Function that returns the names of a world's blocks.
     names_of: Callable[[int], Sequence[str]] | None = None
     # Function that returns which rows of a world are angular, as the argument `angular` of `Problem`.

@@ -16,6 +16,7 @@ import numpy as np
 
 from lavender.base.array_libraries import find_converter
 from lavender.base.arrays import (
+    BoolArray,
     FloatArray,
     check_choice,
     check_float,
@@ -399,62 +400,58 @@ def residual_many(
         threads,
         errors,
     )
-    above_floor = residuals._get_column("above_floor")
-    left = []
-    for i, precision in enumerate(
-        precisions
-    ):  # For a list of problems, the compiled loop assumes float64.
-        is_float32 = precision == "float32" and not is_single_precision
-        is_engine = (
-            i in worlds.engine_motions
-            if type(worlds) is Batch
-            else worlds[i].engine_motion is not None
-        )
-        if (is_float32 or (is_engine and above_floor[i] != 0.0)) and i not in residuals.faults:
-            left.append(i)
-    if type(worlds) is Batch and left and "float32" not in precisions:
-        left = _judge_motions(worlds, residuals, left)
-    for i in left:
+    # For a list of problems, the compiled loop assumes float64.
+    is_left = (
+        np.array(precisions) == "float32"
+        if not is_single_precision
+        else np.zeros(len(worlds), bool)
+    )
+    if type(worlds) is not Batch:
+        is_engine = np.array([p.engine_motion is not None for p in worlds], bool)
+    elif worlds.engine_motions:
+        is_engine = worlds.engine_motions.has_motion.copy()
+    else:
+        is_engine = np.zeros(len(worlds), bool)
+    is_engine &= residuals._get_column("above_floor") != 0.0
+    is_engine[list(residuals.faults)] = is_left[list(residuals.faults)] = False
+    if type(worlds) is Batch and is_engine.any() and "float32" not in precisions:
+        is_engine &= ~_judge_motions(worlds, residuals, is_engine)
+    for i in np.flatnonzero(is_left | is_engine).tolist():
         judge_single(i)
     return residuals
 
 
-def _judge_motions(batch: Batch, residuals: Residuals, moved: list[int]) -> list[int]:
-    """Judge the accelerations that moved the bodies of some worlds; return the worlds that single calls must judge.
+def _judge_motions(batch: Batch, residuals: Residuals, moved: BoolArray) -> BoolArray:
+    """Judge the accelerations that moved the bodies of some worlds (n,); return the worlds that were judged.
 
-    The exact impulses are the solutions from the engine's impulses, as in `EngineMotion.judge`.
+    The exact impulses are the solutions from the engine's impulses, as in `EngineMotion.judge`: these themselves if
+    they are solutions.
     """
-    size = prod(batch.velocity_shape)
-    change = np.zeros(size)
-    compliance = np.zeros(len(residuals._impulse))
-    left = []
-    own = []
-    for i in moved:
-        motion = batch.engine_motions[i]
-        rows = residuals._get_rows(i)
-        is_moved = motion.moved_by == "acceleration"
-        if not is_moved or not np.array_equal(motion.impulse, residuals._impulse[rows]):
-            left.append(i)
-            continue
-        own.append(i)
-        first = int(batch.at[i]["velocity"])
-        change[first : first + len(motion.change)] = motion.change
-        compliance[rows] = motion.compliance
-    if WORLDS_PER_SINGLE * len(own) < len(batch):
-        return sorted(left + own)
-    exact = batch.make_kernel_worlds(residuals._impulse.copy(), np.zeros(size), False)
-    hand = Worker(exact, bytearray(1))
-    while hand.process_worlds(EXACT_TOL, AUTO.call) != NO_MORE_WORLDS:
-        pass  # A single call judges a world that the loop leaves.
-    solved = [i for i in own if exact.code[i] == CODE["ready"]]
-    left += [i for i in own if exact.code[i] != CODE["ready"]]
-    engine = residuals._impulse, change, compliance
+    motions = batch.engine_motions
+    own = moved & motions.find_worlds_moved_by_acceleration(residuals._impulse)
+    judged = np.zeros(len(batch), bool)
+    if WORLDS_PER_SINGLE * int(np.count_nonzero(own)) < len(batch):
+        return judged
+    engine = residuals._impulse, motions.change, motions.compliance
+    limits = EXACT_TOL, MAX_STIFF_RATIO, MAX_EXCUSED_RESIDUAL
     numbers, worst = residuals._worlds.numbers, residuals._worlds.worst
-    refused = judge_motions(
-        exact, EXACT_TOL, MAX_STIFF_RATIO, MAX_EXCUSED_RESIDUAL, engine, solved, numbers, worst
-    )
-    residuals.moved = set(solved) - set(refused)
-    return sorted(left + refused)
+    is_exact = own & (residuals._get_column("relative") <= EXACT_TOL)
+    for worlds, which in ((residuals._worlds, is_exact), (None, own & ~is_exact)):
+        if not which.any():
+            continue
+        if worlds is None:
+            velocity = np.zeros(prod(batch.velocity_shape))
+            worlds = batch.make_kernel_worlds(residuals._impulse.copy(), velocity, False)
+            hand = Worker(worlds, bytearray(1))
+            while hand.process_worlds(EXACT_TOL, AUTO.call) != NO_MORE_WORLDS:
+                pass  # A single call judges a world that the loop leaves.
+            which &= worlds.code[:-1] == CODE["ready"]
+        indices = np.flatnonzero(which)
+        refused = judge_motions(worlds, *limits, engine, indices.tolist(), numbers, worst)
+        judged[indices] = True
+        judged[refused] = False
+    residuals.moved = set(np.flatnonzero(judged).tolist())
+    return judged
 
 
 def check_problems(problems: Any, errors: str) -> Any:

@@ -23,11 +23,12 @@ impulses that have the wrong sign.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.arrays import BoolArray, FloatArray, IntArray
 from lavender.judge.residuals import EXACT_TOL, MAX_STIFF_RATIO, Residual, replace_error
 from lavender.problem import Problem
 from lavender.solving.solve import solve
@@ -138,6 +139,58 @@ class EngineMotion:
         )
         terms: FloatArray = of_jacobian + np.abs(problem.b) + self.compliance * np.abs(self.impulse)
         return ROUNDOFF_OF_PRECISION[problem.precision] * terms
+
+
+class EngineMotions(Mapping[int, EngineMotion]):
+    """The motions of the worlds of a batch, by the index of the world, in flat arrays of all worlds.
+
+    Parameters
+    ----------
+    rows, velocities : (n, 2) int
+        First row and first velocity of each world, and their ends.
+    has_motion : (n,) bool
+        Whether a world has a motion.
+    impulse, compliance : (rows of all worlds,)
+    change, momentum : (velocities of all worlds,)
+    moved_by : {"acceleration", "forces"}
+        As for `EngineMotion`, of every world.
+    """
+
+    def __init__(
+        self,
+        rows: IntArray,
+        velocities: IntArray,
+        has_motion: BoolArray,
+        impulse: FloatArray,
+        change: FloatArray,
+        compliance: FloatArray,
+        moved_by: str,
+        momentum: FloatArray | None,
+    ) -> None:
+        self.rows, self.velocities, self.has_motion = rows, velocities, has_motion
+        self.impulse, self.change, self.compliance = impulse, change, compliance
+        self.moved_by, self.momentum = moved_by, momentum
+
+    def __getitem__(self, i: int) -> EngineMotion:
+        if not (0 <= i < len(self.has_motion) and self.has_motion[i]):
+            raise KeyError(i)
+        of_rows, of_velocities = slice(*self.rows[i]), slice(*self.velocities[i])
+        momentum = None if self.momentum is None else self.momentum[of_velocities]
+        change, compliance = self.change[of_velocities], self.compliance[of_rows]
+        return EngineMotion(self.impulse[of_rows], change, compliance, self.moved_by, momentum)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(np.flatnonzero(self.has_motion).tolist())
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self.has_motion))
+
+    def find_worlds_moved_by_acceleration(self, impulse: FloatArray) -> BoolArray:
+        """Return which worlds (n,) an acceleration has moved, if these flat impulses [N s] are the engine's own."""
+        if self.moved_by != "acceleration":
+            return np.zeros(len(self.has_motion), bool)
+        differs = np.concatenate([[0], np.cumsum(impulse != self.impulse)])
+        return self.has_motion & (differs[self.rows[:, 0]] == differs[self.rows[:, 1]])
 
 
 def _make_velocity_error(

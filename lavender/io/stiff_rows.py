@@ -18,7 +18,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.batch.data import Batch
-from lavender.io.engine_motion import EngineMotion
+from lavender.io.engine_motion import EngineMotions
 from lavender.problem import Problem
 
 # [1/kg] If all compliances are larger, no row is examined. A common contact has 1e-3 to 1.
@@ -88,12 +88,18 @@ def make_engine_batch(
     if stiff and not np.array_equal(raised, engine):
         batch = make_batch(raised.reshape(compliance.shape))
     if impulse is not None and change is not None:
-        flat = impulse.reshape(-1)
-        for i in range(len(batch)) if moved_by == "acceleration" else stiff:
-            rows = batch.rows_of(i)
-            if rows.stop > rows.start:
-                own = None if momentum is None else momentum[i]
-                batch.engine_motions[i] = EngineMotion(
-                    flat[rows], change[i], engine[rows], moved_by, own
-                )
+        at = batch.at
+        has_motion = at["rows"] > 0
+        if moved_by != "acceleration":
+            has_motion &= np.isin(np.arange(len(batch)), list(stiff))
+        batch.engine_motions = EngineMotions(
+            np.stack([at["row"], at["row"] + at["rows"]], axis=1),
+            np.stack([at["velocity"], at["velocity"] + at["velocities"]], axis=1),
+            has_motion,
+            impulse.reshape(-1),
+            change.reshape(-1),
+            engine,
+            moved_by,
+            None if momentum is None else momentum.reshape(-1),
+        )
     return batch

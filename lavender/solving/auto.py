@@ -50,14 +50,19 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
-from lavender.judge.residuals import choose_start, find_relative_at_zero, reuse_or_judge_impulse
-from lavender.judge.solution import Claim, SolverStage, Status
+from lavender.judge.residuals import (
+    choose_start,
+    combine_best_islands,
+    find_relative_at_zero,
+    reuse_or_judge_impulse,
+)
+from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers import certify
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS, describe_numbers
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.registry import Solver, SolverSpec, get, program_backends
-from lavender.solvers.small import AUTO, describe_work
+from lavender.solvers.small import AUTO, describe_stages, describe_work
 from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
 from lavender.solving.loop import EMPTY_CLAIM, Loop
@@ -67,6 +72,10 @@ from lavender_ext.judge.measure import residuals_by_island
 
 assert __doc__ is not None
 __doc__ += describe_numbers() + "\n"
+
+
+#: Claims of a solve that has time and iterations left.
+FAILURES = Status.STALLED, Status.NUMERICAL_ERROR, Status.INFEASIBLE
 
 
 @dataclass
@@ -80,6 +89,10 @@ class AutoState:
     first_stage: int = (
         1  # Position of the first stage that has not run on a problem with more islands.
     )
+    # Whether the user gave the start, so that a solve that fails from it begins again from the zero impulse.
+    has_given_start: bool = False
+    # Claim of the solve that has failed from the start, to which this solve from the zero impulse is added.
+    first_claim: Claim = EMPTY_CLAIM
 
 
 @dataclass(frozen=True)
@@ -109,11 +122,38 @@ class Auto(Solver):
         if state.loop is not None:
             state.recorder = Recorder(state.loop)
             state.recorder.record_impulse("start", 0, impulse)
-        claim = self._run(state, impulse, max_iter, tol, Deadline(time_limit))
+        deadline = Deadline(time_limit)
+        claim = self._run(state, impulse, max_iter, tol, deadline)
+        if state.has_given_start and claim.status in FAILURES and not deadline.has_passed():
+            claim = self._run_from_zero(state, claim, impulse, max_iter, tol, deadline)
         if state.recorder is not None:
             last = claim.stages[-1].solver if claim.stages else "start"
             state.recorder.record_impulse(last, claim.iterations, impulse)
         return claim
+
+    def _run_from_zero(
+        self,
+        state: AutoState,
+        first: Claim,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        deadline: Deadline,
+    ) -> Claim:
+        """Solve once more from the zero impulse, and keep the better result in each island: a start never costs."""
+        problem = state.problem
+        if problem.has_singular_program or first.iterations >= max_iter:
+            return first
+        state.first_claim, state.failed_call = first, None
+        again = problem._start.copy()
+        claim = self._run(state, again, max_iter, tol, deadline)
+        if claim.status is not Status.CONVERGED:
+            is_proved = Status.INFEASIBLE in (first.status, claim.status)
+            again = combine_best_islands(problem, impulse, (again,), tol, by_energy=is_proved)
+            if claim.status is not Status.INFEASIBLE and claim.status is not Status.INTERRUPTED:
+                claim = replace(claim, status=first.status, certificate=first.certificate)
+        impulse[:] = again
+        return replace(claim, message=f"{claim.message}; begun again from the zero impulse")
 
     def _run(
         self, state: AutoState, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
@@ -140,21 +180,24 @@ class Auto(Solver):
                 first = sweeps
                 result_of_sweeps = first.run(impulse, tol, max_iter)
                 if result_of_sweeps is not None:
-                    return result_of_sweeps
+                    return add_claim(state.first_claim, result_of_sweeps)
         may_call = counts is None and max_iter >= DECISIONS.call_iterations
         if may_call and (first is not None or fits_in_time(problem, deadline)):
             # The impulse of sweeps is returned if the call does not end.
             own = deadline if first is not None else choose_call_deadline(problem, deadline)
             result, counts = AUTO.call.solve(problem, impulse, tol, own)
             if result is not None and result.relative <= tol:
-                claim = AUTO.make_claim(problem, counts, impulse, result.relative)
+                claim = add_claim(
+                    state.first_claim,
+                    AUTO.make_claim(problem, counts, impulse, result.relative),
+                )
                 if claim.iterations <= max_iter:
                     impulse[:] = result.impulse
                     return replace(claim, judged=result)
         failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
-        log = SolveLog(problem, tol, max_iter, deadline)
+        log = SolveLog(problem, tol, max_iter, deadline, state.first_claim)
         call_failed = bool(failed) and problem.generalized is not None
         tree = DecisionTree(
             problem,
@@ -180,6 +223,20 @@ class Auto(Solver):
             log.failure = format_error(error)
         impulse[:] = log.choose_result()
         return log.make_claim()
+
+
+def add_claim(first: Claim, claim: Claim) -> Claim:
+    """Return a claim with the stages and the work of an earlier one before its own."""
+    if not first.iterations:
+        return claim
+    stages = first.stages + claim.stages
+    return replace(
+        claim,
+        iterations=first.iterations + claim.iterations,
+        work=sum_work_counts((first.work, claim.work)),
+        message=describe_stages(stages),
+        stages=stages,
+    )
 
 
 class FirstSweeps:

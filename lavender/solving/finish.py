@@ -60,7 +60,7 @@ from lavender.judge.solution import (
     get_order_name,
 )
 from lavender.problem import Problem
-from lavender.problem.cones import project_impulse
+from lavender.problem.cones import ROUND, ROW, project_impulse
 from lavender.solvers.registry import SolverSpec, specs
 from lavender_ext.judge.measure import Judged, all_finite, project_far_excess_of
 
@@ -217,7 +217,7 @@ def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> 
     """Return the other fields of a solution, the status included if the claim needs a check; else it is confirmed."""
     spec = run.spec
     claim = run.claim
-    if not (claim.message or claim.iterations or any(claim.work.values())):
+    if not (claim.iterations or any(claim.work.values())):
         claim = replace(claim, message=explain_why_nothing_ran(run, judged.relative))
         run = run._replace(claim=claim)
     order = ""
@@ -245,18 +245,22 @@ def make_fields(run: FinishedRun, judged: Judged, needs_check: bool = False) -> 
 def explain_why_nothing_ran(run: FinishedRun, relative: float) -> str:
     """Return why no solver ran, as the message of a solution without work; no other function calls a start a solution.
 
-    `relative` is the relative residual of the returned impulse.
+    `relative` is the relative residual of the returned impulse. The message names how many impulses of the start were
+    changed.
     """
-    problem, status = run.problem, run.claim.status
+    problem, claim = run.problem, run.claim
     if not problem.m:
         return "nothing to solve"
-    if status is CONVERGED or relative <= run.tol:
-        start = problem._start if run.start is None else run.start
-        changed = int(np.count_nonzero(run.impulse != start))
-        if not changed:
-            return "the start is a solution"
-        return f"the start is a solution after {changed} of {problem.m} impulses were moved to their bounds or to zero"
-    return REASONS_WITHOUT_WORK.get(status, "no solver ran")
+    start = problem._start if run.start is None else run.start
+    changed = int(np.count_nonzero(run.impulse != start))
+    moved = f"{changed} of {problem.m} impulses were moved to their bounds or to zero"
+    if claim.message:
+        is_moved = changed and run.spec.builtin and not run.spec.external
+        return f"{claim.message}; of the start {moved}" if is_moved else claim.message
+    if claim.status is CONVERGED or relative <= run.tol:
+        return f"the start is a solution after {moved}" if changed else "the start is a solution"
+    reason = REASONS_WITHOUT_WORK.get(claim.status, "no solver ran")
+    return f"{reason}; of the start {moved}" if changed else reason
 
 
 def check_claim(run: FinishedRun, judged: Residual) -> dict[str, Any]:
@@ -412,12 +416,13 @@ def decide_empty_rows(
     Returns
     -------
     tuple or None
-        If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all such rows. None
-        otherwise.
+        If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all such rows, with
+        those of contacts under the cone law that slide. None otherwise.
     """
     cones = problem.cones
-    impossible = list[int]()
     empty = problem.metric.empty
+    impossible = list[int]()
+    directions = {} if problem.law != "cone" else _find_slides_of_empty_contacts(problem)
     # Leave out friction rows, which have no fixed bounds.
     nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if (
@@ -426,15 +431,16 @@ def decide_empty_rows(
         nonzero = nonzero[
             (problem.b[nonzero] > 0.0) | ~np.append(cones.friction_rows, False)[nonzero + 1]
         ]
-    if not len(nonzero):
-        return None
     for i in np.setdiff1d(nonzero, problem.vanished_rows).tolist():
         b = problem.b[i]
         bound = cones.upper[i] if b > 0.0 else cones.lower[i]
+        if i in directions:
+            continue
         if np.isfinite(bound):
             impulse[i] = bound
         else:
             impossible.append(i)
+    impossible += directions
     if not impossible:
         return None
     get_zero_impulse_reference(problem)
@@ -443,13 +449,44 @@ def decide_empty_rows(
     energy = size / np.sqrt(data.d)
     velocity = data.weight * size / data.d
     worst = max(impossible, key=lambda i: divide_by_reference(data, energy[i], velocity[i], [i]))
-    y = np.zeros(problem.m)
     b = problem.b[worst]
+    y = np.zeros(problem.m)
     y[worst] = math.copysign(1.0, b)
+    y = directions.get(worst, y)
     if prove_infeasibility(problem, y, tol).reason:
         return None  # b of these rows is negligible, so that the answer can meet tol.
     unit = "rad/s" if problem.angular_rows[worst] else "m/s"
     message = (
         f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} {unit}"
     )
-    return message, y, impossible
+    if worst in directions:
+        message = f"{problem.row_name(worst)}: the contact's rows of A are zero, so nothing can stop its sliding"
+    rows = [np.flatnonzero(directions[i]) if i in directions else [i] for i in impossible]
+    return message, y, np.concatenate(rows).tolist()
+
+
+def _find_slides_of_empty_contacts(problem: Problem) -> dict[int, FloatArray]:
+    """Return {normal: y (m,)} of contacts under the cone law that slide, and whose rows of A are all zero.
+
+    y = (1, a_g b_g / |b_g|) is the direction of the cone with the largest b.y, which is positive.
+    """
+    cones = problem.cones
+    is_empty = np.zeros(problem.m, bool)
+    is_empty[np.setdiff1d(problem.metric.empty, problem.vanished_rows)] = True
+    found = dict[int, FloatArray]()
+    blocks = np.unique(np.searchsorted(cones.ptr, problem.metric.empty, "right") - 1)
+    for block in blocks[(cones.kind[blocks] != ROW) & (cones.kind[blocks] != ROUND)].tolist():
+        first, end = cones.ptr[block], cones.ptr[block + 1]
+        if (
+            is_empty[first:end].all()
+            and problem.b[first] <= 0.0
+            and problem.b[first + 1 : end].any()
+        ):
+            found[int(first)] = np.zeros(problem.m)
+            found[int(first)][first] = 1.0
+    for block, rows in cones.friction_components() if found else ():
+        size = float(np.hypot.reduce(problem.b[rows]))
+        y = found.get(int(cones.ptr[block]))
+        if y is not None and size > 0.0:
+            y[rows] = cones.friction_coefficient[rows] * problem.b[rows] / size
+    return {i: y for i, y in found.items() if problem.b @ y > 0.0}

@@ -24,7 +24,7 @@ from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
 from lavender.problem import Problem
 from lavender.problem.cones import project_impulse
 from lavender.solvers.small import describe_stages
-from lavender.solving.loop import Loop, Record
+from lavender.solving.loop import EMPTY_CLAIM, Loop, Record
 from lavender_ext.judge.measure import BestImpulse, are_bit_identical, residuals_by_island
 
 # Key in `Derived.cache` of the problem's convex relaxation.
@@ -46,8 +46,14 @@ class SolveLog:
     """Stages that ran on a problem, their work, the best impulse and the deadline."""
 
     def __init__(
-        self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER
+        self,
+        problem: Problem,
+        tol: float,
+        budget: int,
+        deadline: Deadline = NEVER,
+        first: Claim = EMPTY_CLAIM,
     ) -> None:
+        """Begin the log; `first` is the claim of an earlier solve, whose work counts."""
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
         self.failure = ""  # Message of the last arithmetic error.
@@ -64,9 +70,9 @@ class SolveLog:
         )
         # Last impulse (m,) [N s] of the interior points on the convex relaxation, or None.
         self.relaxed: FloatArray | None = None
-        self.stages: list[SolverStage] = []
-        self.work: dict[str, int] = {}
-        self.iterations = 0
+        self.stages: list[SolverStage] = list(first.stages)
+        self.work: dict[str, int] = dict(first.work)
+        self.iterations = first.iterations
         self.certificate: FloatArray | None = (
             None  # Proof (m,) that no solution exists, if one was found.
         )

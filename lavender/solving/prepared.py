@@ -52,6 +52,7 @@ from lavender.judge.residuals import (
     combine_best_islands,
     get_zero_impulse_reference,
     measure_residual,
+    reuse_or_judge_impulse,
 )
 from lavender.judge.solution import (
     CONVERGED,
@@ -364,6 +365,7 @@ class Prepared:
                     reserve_time_of_judge(problem, deadline)
             if self.spec.delegates:
                 setup.state.failed_call = failed_call
+                setup.state.has_given_start = not has_default_start
                 setup.state.loop = loop if history else None
         solution = self._run(loop, setup, max_iter, has_default_start)
         if problem is not original:
@@ -442,6 +444,8 @@ class Prepared:
             self._choose_start(loop, setup, start, has_default_start)
             claim = loop.run(max_iter) if self.spec.resumable else loop.run_in_one_call(max_iter)
             claim = self._select(loop, setup, claim, start)
+            if claim.status is CONVERGED and not (claim.iterations or any(claim.work.values())):
+                self._restore_solved_start(loop, start)
             if claim.certificate is not None and claim.status is INFEASIBLE and loop.tol > 0.0:
                 claim = self._solve_feasible_islands(loop, claim, max_iter)
         return self._finish(loop, claim, start, setup_time)
@@ -499,6 +503,15 @@ class Prepared:
                 found = f"its own impulse has a relative residual of {relative:.2e}"
                 claim = replace(claim, refutation=found)
         return claim
+
+    def _restore_solved_start(self, loop: Loop, start: FloatArray) -> None:
+        """Return a start (m,) that is a solution bit for bit: a solver without work may have scaled or clipped it."""
+        if self.is_foreign or np.array_equal(loop.impulse, start):
+            return
+        judged = reuse_or_judge_impulse(loop.problem, start)
+        if judged.relative <= loop.tol:
+            loop.impulse[:] = start
+            loop.judged = judged
 
     def _finish(self, loop: Loop, claim: Claim, start: FloatArray, setup_time: float) -> Solution:
         """Build the solution: the judge's residual, the status, the message."""

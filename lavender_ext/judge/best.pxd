@@ -28,7 +28,7 @@ from lavender_ext.core.csr cimport measure_asymmetry_and_bandwidth
 from lavender_ext.core.start cimport clip_zero_to_row_bounds, is_zero_impulse
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t, unit_roundoff
-from lavender_ext.judge.tally cimport get_island_block, index_of_island_begin, index_of_island_end
+from lavender_ext.judge.tally cimport get_island_block, index_of_island_begin, index_of_island_end, is_island_unmoved
 
 
 cdef struct objective_t:
@@ -124,11 +124,14 @@ cdef inline bint is_matrix_symmetric(best_t* s, const view_t* v) noexcept nogil:
 
 
 cdef inline bint minimises_objective(best_t* s, const view_t* v, int32_t island) noexcept nogil:
-    """Return whether (1) applies to the island: A is symmetric, and no friction is bounded by Coulomb's law."""
+    """Return whether (1) applies to the island: A is symmetric, impulses move it, and no friction is bounded by Coulomb's law.
+
+    Where no impulse moves a row, f = -b lam falls without end.
+    """
     cdef const blocks_t* p = &v.p
     cdef int32_t a, g
     cdef friction_components_t q
-    if s.by_energy:
+    if s.by_energy or is_island_unmoved(p, island):
         return False
     if p.law != CONE:
         for a in range(index_of_island_begin(p, island), index_of_island_end(p, island)):

@@ -16,6 +16,8 @@ If (2) is zero, no row acts: each row is compared with its own terms, a contact 
 
     relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_residual_by_rows`
 
+    of a contact that no impulse moves at most 1
+
 A row that does not act therefore does not change the residual of rows that do, however large its b is. A row with b = 0 has
 
     s_k = |target_k| + sum_j |J_kj v*_j|, or |b_k| if A is given,   of b = target - J v*                                 (4)
@@ -38,8 +40,8 @@ from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, has_
 from lavender_ext.core.rows cimport get_block_jacobian
 from lavender_ext.core.view cimport get_block_bodies, view_t
 from lavender_ext.judge.score cimport relative_residual, unit_roundoff
-from lavender_ext.judge.tally cimport (add_block_error, get_block_in_order, make_empty_tally, relative_residual_by_rows,
-                                       relative_residual_of_unmoved_rows, tally_t)
+from lavender_ext.judge.tally cimport (add_block_error, get_block_in_order, is_island_unmoved, make_empty_tally,
+                                       relative_residual_by_rows, relative_residual_of_unmoved_rows, tally_t)
 
 
 cdef inline double max_rounding_ratio() noexcept nogil:
@@ -181,19 +183,6 @@ cdef inline bint has_island_without_scale(const blocks_t* p, const int32_t* empt
                             and not (empty != NULL and empty[k])):
                         return True
     return False
-
-
-cdef inline bint is_island_unmoved(const blocks_t* p, int32_t island) noexcept nogil:
-    """Return whether no impulse moves a row of the island, by the signs of its terms."""
-    cdef int32_t a, i, k
-    if p.islands.terms == NULL:
-        return False
-    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
-        i = p.islands.order[a]
-        for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not p.islands.terms[k] < 0.0:
-                return False
-    return True
 
 
 cdef inline double compute_row_terms(const view_t* v, const double* free, int32_t i, int32_t k) noexcept nogil:

@@ -74,6 +74,8 @@ cdef inline double relative_residual_by_rows(const blocks_t* p, const int32_t* o
         for k in range(j, p.ptr[i + 1]):
             s += (p.d[k] * e[k]) * e[k]
         r = ratio_to_row_terms(p, j, sqrt(p.d[j]) * sqrt(s))
+        if r > 1.0 and p.islands != NULL and p.islands.terms != NULL and p.islands.terms[j] < 0.0:
+            r = 1.0                                     # Whatever the impulse of a contact that nothing moves is.
         worst = r if r > worst else worst
     return worst
 
@@ -230,6 +232,19 @@ cdef inline int32_t index_of_island_begin(const blocks_t* p, int32_t island) noe
 cdef inline int32_t index_of_island_end(const blocks_t* p, int32_t island) noexcept nogil:
     """Return one past the index in `order` of the last block of an island."""
     return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
+
+
+cdef inline bint is_island_unmoved(const blocks_t* p, int32_t island) noexcept nogil:
+    """Return whether no impulse moves a row of the island, by the signs of its terms."""
+    cdef int32_t a, i, k
+    if p.islands == NULL or p.islands.terms == NULL:
+        return False
+    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+        i = p.islands.order[a]
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not p.islands.terms[k] < 0.0:
+                return False
+    return True
 
 
 cdef inline void add_island_to_score(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,

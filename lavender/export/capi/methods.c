@@ -189,6 +189,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
     how = begin_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
+  COPY(s->compare, s->impulse, s->p.n_rows);
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
     how = k_step(&s->view, &s->newton_options, &s->drive, 1 << 30, s->impulse, &info);
     out->iterations = before + info.work;
@@ -198,8 +199,13 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     }
     if (how == core_method_REACHED) {
       judge(s, s->impulse, 1, INFINITY, &now); /* Confirm it: the velocity form rounds sums in another order, and its squares may underflow. */
-      if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
-      else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
+      if (now.relative <= budget->tol) {
+        out->outcome = LAV_CONVERGED;
+        if (out->iterations == 0) { /* Scaling has rounded a start that is a solution. */
+          judge(s, s->compare, 1, INFINITY, &now);
+          if (now.relative <= budget->tol) COPY(s->impulse, s->compare, s->p.n_rows);
+        }
+      } else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
       else {
         before = out->iterations;
         closer *= 0.25;

@@ -4,9 +4,11 @@ solution only if it is returned as it was given and meets the tolerance.
 
 import numpy as np
 import pytest
+from drawn_worlds import AXES, draw_worlds
 from random_problems import as_matrix, general, make_well_posed_problem
 
 import lavender as lv
+from lavender.judge.residuals import combine_best_islands
 from lavender.problem.cones import project_impulse
 from lavender.solvers import registry
 
@@ -119,3 +121,39 @@ def test_what_ran_is_what_is_said(solver, law):
                 if fault:
                     faults.append((name, named, call, fault, solution.message, dict(solution.work)))
     assert not faults, "\n".join(map(str, faults[:20])) + f"\n{len(faults)} in all"
+
+
+def is_behind(problem, impulse, other, tol, by_energy):
+    """Return whether an island of `impulse` ends behind `other` by the measure of the returned impulse."""
+    inside = project_impulse(problem.cones, other)
+    best = combine_best_islands(problem, impulse, (inside,), tol, by_energy=by_energy)
+    return not np.array_equal(best, impulse)
+
+
+@pytest.mark.parametrize(("seed", "law"), [(14, "lcp"), (46, "cone"), (1012, "cone")])
+def test_a_start_costs_nothing(seed, law, monkeypatch):
+    if seed == 1012:  # Contacts that no impulse moves, and that slide.
+        monkeypatch.setitem(AXES, "coupling", ("an empty row",))
+    rng = np.random.default_rng(seed)
+    faults = []
+    for i, world in enumerate(draw_worlds(seed, 14, law)):
+        problem = world.make_problem()
+        cold = lv.solve(problem, tol=1e-9)
+        size = np.abs(cold.impulse).max() or 1.0
+        noise = rng.standard_normal(problem.m)
+        near = cold.impulse * (1.0 + 1e-3 * noise)
+        for start in (size * noise, 1e6 * size * noise, 1e20 * noise, near, np.ones(problem.m)):
+            s = lv.solve(problem, impulse=start, tol=1e-9)
+            is_said = s.work or np.array_equal(s.impulse, start) or "were moved" in s.message
+            if not is_said:
+                faults.append((i, "the start was replaced silently", s.message))
+            if s.residual.relative <= 1e-9 or s.status is lv.Status.ROUNDOFF_LIMIT:
+                continue
+            proved = s.status is lv.Status.INFEASIBLE
+            if cold.residual.relative <= 1e-9:
+                faults.append((i, "solved without the start", s.message))
+            elif is_behind(problem, s.impulse, cold.impulse, 1e-9, proved):
+                faults.append((i, "behind the solve without a start", s.message))
+            if world.choice["coupling"] == "an empty row" and s.residual.relative > 1.0:
+                faults.append((i, "a row that no impulse moves is off by more than 1", s.message))
+    assert not faults, faults
