@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lavender.audit.bodies import find_bodies, find_geom, get_geoms
+from lavender.audit.idle_settings import MIN_CHANGE, PHYSICS_OPTIONS, list_idle_settings
 from lavender.audit.page import FORCES_NOTE, ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
 from lavender.audit.settings import MujocoSetting, get_option_value
@@ -67,6 +68,7 @@ class SlipOfStates:
     # its numbers are not finite, or above 1e10.
     diverged: tuple[int, ...] = ()
     run_notes: tuple[str, ...] = ()  # Sentences about the worlds and their start states.
+    left_out: str = ""  # Sentence on settings that were not simulated; else empty.
     provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
 
     @property
@@ -201,6 +203,7 @@ class SlipOfStates:
         advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
         sentences = [" ".join(self.sentences), *filter(None, [advice])]
         footer = [
+            *filter(None, [self.left_out]),
             "Files: forces.csv (contacts of all states), numbers.json, figures/ (PDF, SVG, PNG)."
         ]
         return Page(
@@ -279,13 +282,13 @@ def explain_slip_of_states(
     touching = [(e, state) for _, state, e in found if e is not None and state is not None]
     explanations = [e for e, _ in touching]
     diverged = tuple(world for world, state, _ in found if state is None)
+    left_out = ""
     if explanations:
-        _simulate_remedies(
+        left_out = _simulate_remedies(
             mj, model, explanations, [state for _, state in touching], workers, watch
         )
-    return SlipOfStates(
-        tuple(explanations), n, diverged, runs.notes, describe_provenance(model, runs.name)
-    )
+    provenance = describe_provenance(model, runs.name)
+    return SlipOfStates(tuple(explanations), n, diverged, runs.notes, left_out, provenance)
 
 
 def _explain_world(
@@ -342,8 +345,10 @@ def _simulate_remedies(
     starts: list[FloatArray],
     workers: int,
     watch: Any,
-) -> None:
+) -> str:
     """Simulate settings from the states in which the followed pair slides fastest, and add their results.
+
+    Settings of physics that hardly change the fastest step are left out; the result is a sentence that names them.
 
     The followed pair of bodies has the fastest contact of the pairs that touch in at least half of the states: any
     geoms of the two bodies count, because a pad may hold when the mesh beside it separates.
@@ -355,14 +360,17 @@ def _simulate_remedies(
     candidates = points[points["bodies"].isin(lasting)] if len(lasting) else points
     first = candidates.iloc[int(candidates["speed"].to_numpy().argmax())]
     if not first["speed"] > MIN_EXPLAINED_SLIP or np.isnan(first["use"]):
-        return  # No setting changes the slip of a contact without normal force.
+        return ""  # No setting changes the slip of a contact without normal force.
     pair, fastest = str(first["bodies"]), int(first["k"])
     own = points[points["bodies"] == pair]
     sliding = own.groupby("k")["speed"].mean().sort_values(ascending=False, kind="stable")
     chosen = [starts[k] for k in sliding.index[:MAX_REMEDY_STATES]]
     settings = list(_change_settings(mj, model, pair, own["contact"]))
+    physics = {text: changed for text, changed, is_physics in settings if is_physics}
+    idle = list_idle_settings(mj, model, chosen[0], physics)
+    settings = [x for x in settings if x[0] not in idle]
     remedies: list[Remedy] = []
-    for k, (text, changed) in enumerate(settings):
+    for k, (text, changed, _) in enumerate(settings):
         if watch is not None:
             states = format_count(len(chosen), "state")
             watch(Event(k, len(settings), states, "", phase="simulating settings"))
@@ -378,6 +386,9 @@ def _simulate_remedies(
     explanations[fastest] = replace(
         explanations[fastest], remedies=tuple(remedies), n_states=len(chosen), followed=pair
     )
+    change = f"less than {100.0 * MIN_CHANGE:.0f} %"
+    names = "; ".join(idle)
+    return f"Not simulated, because it changes the fastest step by {change}: {names}." if idle else ""
 
 
 def _get_uses(explanation: SlipExplanation) -> FloatArray:
@@ -388,12 +399,13 @@ def _get_uses(explanation: SlipExplanation) -> FloatArray:
 
 def _change_settings(
     mj: Any, model: Any, pair: str, contacts: Iterable[str]
-) -> Iterator[tuple[str, Any]]:
-    """Yield the text of each setting that can reduce the slip of two bodies, with the changed model.
+) -> Iterator[tuple[str, Any, bool]]:
+    """Yield (text, changed model, whether it may be left out) of settings that can reduce the slip of two bodies.
 
-    `contacts` are the names of their contacts. The first model is the model itself.
+    `contacts` are the names of their contacts. The first model is the model itself. Settings of cones and softness may
+    be left out.
     """
-    yield "as it is", model
+    yield "as it is", model, False
     options: list[dict[str, Any]] = [
         {"iterations": 10 * int(model.opt.iterations), "tolerance": 1e-12},
         {"impratio": 10.0 * float(model.opt.impratio)},
@@ -402,13 +414,16 @@ def _change_settings(
     if get_option_value(mj, model, "cone") == "pyramidal":
         options += [{"cone": "elliptic", **x} for x in ({}, *options[1:])]
     settings = dict.fromkeys(MujocoSetting.from_options(mj, model, **x) for x in options)
-    yield from ((s.option_line, s.apply_to(mj, model)) for s in settings if s.options)
+    for s in settings:
+        if s.options:
+            is_physics = all(name in PHYSICS_OPTIONS for name, _ in s.options)
+            yield s.option_line, s.apply_to(mj, model), is_physics
     shortest = 2.0 * model.opt.timestep  # MuJoCo uses no shorter time constant.
     if model.geom_solref[:, 0].max(initial=0.0) > shortest:  # Negative values are stiffnesses.
         changed = copy.deepcopy(model)
         for solref in (changed.geom_solref, changed.pair_solref):
             solref[solref[:, 0] > shortest] = shortest, 1.0
-        yield f'solref="{shortest:g} 1" of all geoms', changed
+        yield f'solref="{shortest:g} 1" of all geoms', changed, True
 
     names = list(dict.fromkeys(x for c in contacts for x in get_geoms(c).split(", ")))
     numbers = [find_geom(mj, model, name) for name in names]
@@ -418,7 +433,7 @@ def _change_settings(
         changed.geom_friction[numbers, 0] = friction
         is_own_pair = np.isin(model.pair_geom1, numbers) & np.isin(model.pair_geom2, numbers)
         changed.pair_friction[is_own_pair, :2] *= FRICTION_FACTOR
-        yield f'friction="{friction:g}" of {" and ".join(names)}', changed
+        yield f'friction="{friction:g}" of {" and ".join(names)}', changed, False
 
 
 def _simulate_slip(

@@ -1,8 +1,11 @@
 """The causes that an audit names: of errors against the engine's own problem, and against the rigid laws."""
 
+import numpy as np
 import pytest
 
 from lavender.audit.audit import audit
+from lavender.audit.idle_settings import list_idle_settings
+from lavender.audit.settings import MujocoSetting
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
@@ -45,3 +48,34 @@ def test_exact_step_that_damping_pushes_on_names_integrator_and_softness_with_in
     assert cause.causes == ("integrator", "softness") and cause.own == ("", 0.0)
     total = sum(mean for _, mean, _, _ in cause.parts)
     assert total == pytest.approx(cause.difference, rel=1e-6)
+
+
+# A box slides along both axes of the plane.
+PUSHED = """<mujoco><option cone="pyramidal"/><worldbody><geom type="plane" size="3 3 .1" condim="{condim}"/>
+<body pos="0 0 .0499"><freejoint/><geom type="box" size=".05 .05 .05" condim="{condim}"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("condim", "expected"), [(1, {"cone", "impratio"}), (3, set())])
+def test_only_settings_that_hardly_change_the_step_are_idle(condim, expected):
+    """Without friction, neither the cone nor the ratio of impedances matters; in a slide, both do."""
+    model = mujoco.MjModel.from_xml_string(PUSHED.format(condim=condim))
+    data = mujoco.MjData(model)
+    data.qvel[:2] = 0.7, 0.4
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    changed = {
+        "cone": MujocoSetting((("cone", "elliptic"),)).apply_to(mujoco, model),
+        "impratio": MujocoSetting((("impratio", 10.0),)).apply_to(mujoco, model),
+    }
+    found = list_idle_settings(mujoco, model, state, changed)
+    assert set(found) == expected
+    own, other = (step_velocity(m, state, kind) for m in (model, changed["cone"]))
+    assert (np.abs(own - other).max() > 1e-3) == ("cone" not in found)
+
+
+def step_velocity(model, state, kind):
+    data = mujoco.MjData(model)
+    mujoco.mj_setState(model, data, state, kind)
+    mujoco.mj_step(model, data)
+    return np.array(data.qvel)

@@ -186,6 +186,21 @@ class Stage:
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return step_times, ends
 
+    def read_state(self, step: int) -> FloatArray:
+        """Return MuJoCo's state (size,) before a step, counted over all stretches, with the model's own setting."""
+        mj, model = self.mj, self.model
+        kind, horizon = mj.mjtState.mjSTATE_INTEGRATION, self.controls.shape[1]
+        data = mj.MjData(model)
+        stretch, last = divmod(step, horizon)
+        mj.mj_setState(model, data, self.starts[stretch], kind)
+        for k in range(last + 1):
+            data.ctrl[:] = self.controls[stretch, k]
+            if k < last:
+                mj.mj_step(model, data)
+        state = np.empty(self.starts.shape[1])
+        mj.mj_getState(model, data, state, kind)
+        return state
+
     def judge_setting(self, setting: MujocoSetting, limit: float = np.inf) -> Measured:
         """Judge a setting without timing it; its errors are infinite if a world diverges.
 

@@ -66,6 +66,7 @@ class Tuning:
     )
     # Sentences about the differences from a simulation of the model as it is: no sleep, a smaller spread.
     notes: tuple[str, ...] = ()
+    left_out: str = ""  # Sentence on settings that were not timed; else empty.
     n_held_worlds: int = 0
     # [m/s] The fastest setting whose error does not exceed this number in any step is also recommended.
     error_limit: float | None = None
@@ -416,7 +417,10 @@ class Tuning:
         n_settings = format_count(len(self._same_problem), "setting")
         source = f"lavender tune · {Path(self.model).name} · {n_settings}"
         is_bad = worst > self.shown_limit
-        footer = ["Files: numbers.json, figures/ as PDF, SVG and PNG."]
+        footer = [
+            *filter(None, [self.left_out]),
+            "Files: numbers.json, figures/ as PDF, SVG and PNG.",
+        ]
         code = [m.setting.option_line] if m is not None and m.setting.option_line else []
         mark = "✗ above the limit now" if is_bad else "✓ within the limit now"
         if self.reason_without_line:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.audit.idle_settings import MIN_CHANGE, PHYSICS_OPTIONS, list_idle_settings
 from lavender.audit.page import StepSizes
 from lavender.audit.provenance import describe_provenance
 from lavender.audit.settings import MujocoSetting
@@ -164,6 +165,7 @@ def _measure_settings(tuning: Tuning, runs: Runs, repeats: int, progress: Progre
         progress.expected = repeats
         stage.time_settings(measured, repeats, progress)
         return
+    first_settings = _leave_idle_out(tuning, stage, first_settings)
     # Settings with a larger error cannot be chosen.
     limit = max(float(measured[0].error.max()), tuning.threshold, error_limit or 0.0)
     measured += stage.judge_settings(first_settings[1:], progress, limit)
@@ -190,3 +192,20 @@ def _measure_settings(tuning: Tuning, runs: Runs, repeats: int, progress: Progre
     progress.expected = 2 * repeats * len(held)
     held_back.time_settings(held, 2 * repeats, progress)
     tuning.held = held if np.isfinite(held[0].mean_step_time) else []
+
+
+def _leave_idle_out(
+    tuning: Tuning, stage: Stage, settings: list[MujocoSetting]
+) -> list[MujocoSetting]:
+    """Return the settings without those of physics that hardly change the worst step; a note names them."""
+    tried = {
+        s: s.apply_to(stage.mj, stage.model)
+        for s in settings if s.options and all(name in PHYSICS_OPTIONS for name, _ in s.options)
+    }  # fmt: skip
+    worst = stage.read_state(int(np.argmax(tuning.measured[0].error)))
+    idle = list_idle_settings(stage.mj, stage.model, worst, tried)
+    if idle:
+        names = "; ".join(s.short_name for s in idle)
+        change = f"less than {100.0 * MIN_CHANGE:.0f} %"
+        tuning.left_out = f"Not timed, because it changes the worst step by {change}: {names}."
+    return [s for s in settings if s not in idle]
