@@ -1,6 +1,6 @@
-"""Make the pictures of the pages that README and the documentation show: docs/static/report.png, audit.png.
+"""Make the pictures of pages for README and the documentation: docs/static/report.png, audit.png, compare.png.
 
-    python docs/pictures.py [report] [audit]
+    python docs/pictures.py [report] [audit] [compare]
 
 Each picture is the first screen of a page that the command has just written, in Chromium without a window (playwright,
 the extra `dev`). A page with a warning that is not `ACCEPTED`, such as that of a busy machine, is refused: the earlier
@@ -22,10 +22,23 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # benchmarks
 from benchmarks.page import browse
 
 STATIC = Path(__file__).resolve().parent / "static"
+STEP = str(
+    Path(__file__).resolve().parent.parent / "tests" / "causes" / "recorded" / "gripper_{}.npz"
+)
 #: Arguments of the command, and width and height of its first screen in pixels.
 PICTURES = {
     "report": (["report"], (1180, 1000)),
     "audit": (["audit", "MODEL", "--worlds", "64", "--steps", "200"], (1100, 778)),
+    "compare": (
+        [
+            "compare",
+            STEP.format("mujoco_4.0.0"),
+            STEP.format("genesis_1.4.5"),
+            "--out",
+            "lavender-compare",
+        ],
+        (1000, 430),
+    ),
 }
 #: Beginnings of warnings that a picture may show. After 4 iterations, far from a solution, the impulses of admm add up
 #: to 12 J on three cases of the default suite; the first report of every reader says so, too.

@@ -109,7 +109,7 @@ def find_different_parts(a: StepRecord, b: StepRecord, pairing: Pairing) -> froz
         "force": ("force", "gravity", "stiffness_matrix"),
         "damping": ("damping_matrix", "damping_force", "fluid_matrix"),
         "actuators": ("actuator_matrix", "actuator_force"),
-        "method": ("integrator_matrix", "integrator_force"),
+        "method": ("integrator_matrix", "integrator_force", "velocity_change"),
     }
     for part, names in arrays.items():
         if not all(_are_equal(getattr(a, x), getattr(b, x)) for x in names):

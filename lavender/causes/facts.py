@@ -25,7 +25,7 @@ RELATIVE_TOLERANCE = 1e-6  # [-] Numbers that differ by less are not facts.
 # [-] A change is proposed if the largest difference falls by at least this part.
 MIN_IMPROVEMENT = 0.1
 # [-] Of several changes, the smallest one is proposed whose improvement is at most this much below the best.
-IMPROVEMENT_TOLERANCE = 0.05
+IMPROVEMENT_TOLERANCE = 0.02
 SETTABLE = ("mass", "force", "integrator", "softness", "friction")
 WEIGHT_TOLERANCE = 1e-4  # [-] The same, of inverse masses in float32.
 ROLE_WORDS = {
@@ -329,10 +329,20 @@ def describe_change(comparison: Difference, name: str) -> str:
                 if x.rule == y.rule == "impedance" and _differ(x.solref, y.solref)}  # fmt: skip
         fixed = b.settings.get("constraint_timeconst")
         replaced = [y for x, y in pairs if _differ(x.solref, y.solref)]
-        if len(ours) == 1 and all(
-            fixed and abs(float(y.solref[0]) - fixed) < 1e-9 for y in replaced
+        times = {float(x.solref[0]) for x, y in pairs if _differ(x.solref, y.solref)}
+        only_times = all(
+            x.rule == y.rule == "impedance" and not _differ(x.solref[1], y.solref[1])
+            and not _differ(x.solimp, y.solimp)
+            for x, y in pairs
+        )  # fmt: skip
+        # Contacts mix the time constants of two geoms, of which one may have the fixed one.
+        if (
+            fixed
+            and len(times) == 1
+            and only_times
+            and min(float(y.solref[0]) for y in replaced) >= fixed - 1e-9
         ):
-            return f"constraint_timeconst={next(iter(ours.values()))[0]:g}"
+            return f"constraint_timeconst={times.pop():g}"
         if len(ours) == 1 and not any(_differ(x.solimp, y.solimp) for x, y in pairs):
             return f'solref="{next(iter(ours))}"'
     if name == "integrator":

@@ -101,6 +101,8 @@ def solve_mixture(
     inverse = np.asarray(np.linalg.inv(metric), float)
     free = before + dt * inverse @ smooth
     after = before + dt * np.linalg.solve(mass + added, smooth)
+    if sources["method"].velocity_change is not None:
+        after = after + sources["method"].velocity_change
     rows = [
         part
         for record, i in _iterate_blocks(sources, pairing)

@@ -21,6 +21,7 @@ from lavender.report.text import format_count
 MIN_DRAWN_PART = 0.005  # [-] Smaller parts of the difference are drawn together.
 ROW_HEIGHT, EDGE_HEIGHT = 0.3, 0.75  # [inches] Of a bar, and of title, axis and its label.
 DRAWN_QUANTITIES = 3
+LABEL_SPACE = 0.16  # [-] Of the axis beside the bars.
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +164,12 @@ def draw_waterfall(comparison: Comparison, quantity: Quantity, name: str, folder
         axes.set_yticks(range(len(names)), [n[:22] for n in names])
         axes.invert_yaxis()
         axes.axvline(0.0, color=INK, lw=0.7)
-        axes.margins(x=0.18)
+        left, right = axes.get_xlim()
+        left, right = min(0.0, left), max(0.0, right)
+        # The numbers stand to the right of the bars.
+        axes.set_xlim(
+            left - LABEL_SPACE * (right - left) * (left < 0.0), right + LABEL_SPACE * (right - left)
+        )
         axes.set_xlabel(f"{quantity.name} after one step [{quantity.unit}]", parse_math=False)
         return "; ".join(f"{n} {t}" for n, t in zip(names, texts, strict=True))
 

@@ -53,7 +53,7 @@ def compare(
     ingredients can be exchanged, with the interval of all orders. The output names what differs, and what to try, which
     is solved first. Without a second argument and --option, the model is compared with the rigid laws.
 
-    A step of another version, or of newton's SolverMuJoCo, is a file: --save, or lavender.io.save_step in Python.
+    A step of another version or engine is a file: --save, or lavender.io.save_step in Python.
     """
     require_packages("lavender compare", *REPORT_PACKAGES)
     from lavender.audit.page import ResultPage

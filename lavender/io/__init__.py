@@ -9,8 +9,9 @@
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
 from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
 `from_kamino`, `from_newton_mujoco` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo
-simulation to a folder, `Recorder` writes problems from any loop. `step_from_mujoco` reads everything that determines
-one step, for `lavender.compare`; `save_step` and `load_step` store it.
+simulation to a folder, `Recorder` writes problems from any loop. `step_from_mujoco`, `step_from_genesis`,
+`step_from_newton_mujoco`, `step_from_warp` and `step_from_mjx` read everything that determines one step, for
+`lavender.compare`; `save_step` and `load_step` store it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from lavender.io.drake import from_drake
 from lavender.io.efc import MujocoScratch, from_efc, from_mujoco_many
 from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.genesis import from_genesis
+from lavender.io.genesis_step import step_from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
 from lavender.io.mujoco_step import step_from_mujoco
@@ -37,7 +39,12 @@ from lavender.io.recording import Recording, record
 from lavender.io.step_record import StepRecord, load_step, permute_velocities, save_step
 from lavender.io.stored import HDF5, as_path, read_bytes
 from lavender.io.velocities import Reconstruction, reconstruct
-from lavender.io.warp_step import align_step, step_from_newton_mujoco
+from lavender.io.warp_step import (
+    align_step,
+    step_from_mjx,
+    step_from_newton_mujoco,
+    step_from_warp,
+)
 from lavender.problem import Problem
 
 __all__ = [
@@ -72,8 +79,11 @@ __all__ = [
     "record",
     "save",
     "save_step",
+    "step_from_genesis",
+    "step_from_mjx",
     "step_from_mujoco",
     "step_from_newton_mujoco",
+    "step_from_warp",
 ]
 __dir__ = sorted(__all__).copy  # Completion shows public names only.
 

@@ -62,11 +62,7 @@ def from_genesis(scene: Any) -> EngineStep:
         The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with torsional
         or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth force.
     """
-    solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
-    if solver is None or not getattr(scene, "is_built", False):
-        raise InputError(
-            f"scene is a {type(scene).__name__}; a built genesis.Scene of rigid bodies is needed"
-        )
+    solver = find_solver(scene)
     try:
         step = _convert_solver_arrays(scene, solver)
         # Coefficients of materials, and whether a plane has none and therefore the default one.
@@ -90,14 +86,24 @@ def from_genesis(scene: Any) -> EngineStep:
     return step
 
 
+def find_solver(scene: Any) -> Any:
+    """Return the rigid solver of a built scene."""
+    solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
+    if solver is None or not getattr(scene, "is_built", False):
+        raise InputError(
+            f"scene is a {type(scene).__name__}; a built genesis.Scene of rigid bodies is needed"
+        )
+    return solver
+
+
 def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     """Read the engine's arrays and build the batch."""
     config = solver.rigid_config
     constraints = solver.constraint_solver.constraint_state
-    _check_configuration(scene, solver)
-    rows = _copy_to_host(constraints.n_constraints).astype(np.int32)
+    check_configuration(scene, solver)
+    rows = copy_to_host(constraints.n_constraints).astype(np.int32)
     equalities, losses, contact_rows = (
-        _copy_to_host(getattr(constraints, f"n_constraints_{kind}")).astype(np.int64)
+        copy_to_host(getattr(constraints, f"n_constraints_{kind}")).astype(np.int64)
         for kind in ("equality", "frictionloss", "cone")
     )
     n = len(rows)
@@ -105,7 +111,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
     size = int(config.rows_per_contact)
     is_elliptic = bool(config.enable_elliptic_friction)
     if not is_elliptic:
-        contact_rows = size * _copy_to_host(solver.collider.collider_state.n_contacts).astype(
+        contact_rows = size * copy_to_host(solver.collider.collider_state.n_contacts).astype(
             np.int64
         )
     index = np.arange(m)
@@ -116,7 +122,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         [EQUALITY, FRICTION[0], contact_type],
         LIMIT,
     )
-    loss = _copy_to_host(constraints.efc_frictionloss, m).T
+    loss = copy_to_host(constraints.efc_frictionloss, m).T
     contacts = None
     if is_elliptic:
         # The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of
@@ -131,8 +137,8 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         contacts = world, address, np.full(len(world), size), friction
     dofs = solver.dyn_state.dofs
     dt = float(solver.substep_dt)
-    jac = np.ascontiguousarray(np.moveaxis(_copy_to_host(constraints.jac, m), 2, 0))
-    velocity = _copy_to_host(dofs.vel).T.astype(float) - dt * _copy_to_host(dofs.acc).T
+    jac = np.ascontiguousarray(np.moveaxis(copy_to_host(constraints.jac, m), 2, 0))
+    velocity = copy_to_host(dofs.vel).T.astype(float) - dt * copy_to_host(dofs.acc).T
     moved_by = "acceleration"
     if config.enable_mujoco_compatibility:
         from genesis import integrator
@@ -140,7 +146,7 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
         moved_by = "forces" if config.integrator == integrator.implicitfast else moved_by
         if (
             config.integrator == integrator.Euler
-            and _copy_to_host(solver.dyn_info.dofs.damping).any()
+            and copy_to_host(solver.dyn_info.dofs.damping).any()
         ):
             raise CapabilityError(
                 "enable_mujoco_compatibility with Euler moves trees with damping by forces and others by "
@@ -148,28 +154,28 @@ def _convert_solver_arrays(scene: Any, solver: Any) -> EngineStep:
             )
     result = from_efc(
         efc_J=jac,
-        efc_D=_copy_to_host(constraints.efc_D, m).T,
-        efc_aref=_copy_to_host(constraints.aref, m).T,
+        efc_D=copy_to_host(constraints.efc_D, m).T,
+        efc_aref=copy_to_host(constraints.aref, m).T,
         efc_type=row_type,
-        M=np.ascontiguousarray(np.moveaxis(_copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
+        M=np.ascontiguousarray(np.moveaxis(copy_to_host(solver.rigid_info.mass_mat), 2, 0)),
         qvel=velocity.astype(jac.dtype),
-        qacc_smooth=_copy_to_host(dofs.acc_smooth).T,
+        qacc_smooth=copy_to_host(dofs.acc_smooth).T,
         timestep=dt,
         efc_frictionloss=np.abs(loss),
         nefc=rows,
         contacts=contacts,
-        efc_force=_copy_to_host(constraints.efc_force, m).T,
-        qfrc_smooth=_copy_to_host(dofs.qf_smooth).T,
-        qacc=_copy_to_host(constraints.qacc).T,
+        efc_force=copy_to_host(constraints.efc_force, m).T,
+        qfrc_smooth=copy_to_host(dofs.qf_smooth).T,
+        qacc=copy_to_host(constraints.qacc).T,
         moved_by=moved_by,
         friction="coulomb" if config.enable_signorini_contact else "cone",
     )
-    converged = ~_copy_to_host(constraints.improved).astype(bool)
+    converged = ~copy_to_host(constraints.improved).astype(bool)
     assert result.impulse is not None
     return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
 
 
-def _check_configuration(scene: Any, solver: Any) -> None:
+def check_configuration(scene: Any, solver: Any) -> None:
     """Raise CapabilityError if an option makes the engine solve another problem."""
     config = solver.rigid_config
     coupler = type(scene.sim.coupler).__name__
@@ -195,7 +201,7 @@ def _check_configuration(scene: Any, solver: Any) -> None:
             )
 
 
-def _copy_to_host(array: Any, rows: int | None = None) -> Any:
+def copy_to_host(array: Any, rows: int | None = None) -> Any:
     """Copy the first `rows` rows of an engine's array to host memory, in the array's logical order of dimensions."""
     from genesis.utils.misc import qd_to_torch
 

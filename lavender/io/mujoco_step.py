@@ -206,12 +206,7 @@ class StepReader:
 
     def read_mass(self) -> FloatArray:
         """Return M (nv, nv)."""
-        full = np.zeros((self.nv, self.nv))
-        try:
-            self.mj.mj_fullM(self.model, full, self.data.qM)
-        except (TypeError, AttributeError):  # MuJoCo 4 stores M in compressed rows only.
-            self.mj.mj_fullM(self.model, self.data, full)
-        return full
+        return read_mass(self.mj, self.model, self.data)
 
     def measure_added_matrix(self, mass: FloatArray) -> FloatArray:
         """Return H (nv, nv): columns of (M + H)^-1 by the engine's own integrator, from unit forces."""
@@ -747,6 +742,16 @@ def _gather_force(
     if not is_pyramid or condim == 1:
         return np.array(force)
     return np.append(force.sum(), friction[: condim - 1] * (force[0::2] - force[1::2]))
+
+
+def read_mass(mj: Any, model: Any, data: Any) -> FloatArray:
+    """Return M (nv, nv) of MuJoCo's data."""
+    full = np.zeros((model.nv, model.nv))
+    try:
+        mj.mj_fullM(model, full, data.qM)
+    except (TypeError, AttributeError):  # MuJoCo 4 stores M in compressed rows only.
+        mj.mj_fullM(model, data, full)
+    return full
 
 
 def name_bodies_and_joints(model: Any) -> tuple[list[str], list[str]]:

@@ -233,6 +233,8 @@ class StepRecord:
         Minus the derivative of a fluid's forces by the velocity [N s/m, N m s]; they are part of `damping_force`.
     uses_fluid : bool
         Whether the integrator is implicit in the fluid's forces.
+    velocity_change : (nv,), m/s, rad/s, optional
+        Added by the integrator to the velocity of equation (1), such as by an implicit midpoint rule.
     reference_position : (nq,), optional
         Positions at which the joints are in the model's initial pose.
     before_noslip : tuple of arrays, optional
@@ -280,6 +282,7 @@ class StepRecord:
     before_noslip: tuple[FloatArray, ...] | None = None
     fluid_matrix: FloatArray | None = None
     uses_fluid: bool = False
+    velocity_change: FloatArray | None = None
     reference_position: FloatArray | None = None
     weights: Mapping[str, float | FloatArray] = field(default_factory=dict)
     softnesses: Mapping[str, Softness] = field(default_factory=dict)
@@ -308,7 +311,15 @@ class StepRecord:
         for block, force in zip(self.blocks, forces, strict=True):
             push += block.jacobian[: len(force)].T @ force
         matrix = self.mass + self.added_matrix
-        return self.velocity + self.dt * np.linalg.solve(matrix, self.smooth_force + push)
+        change = self.dt * np.linalg.solve(matrix, self.smooth_force + push)
+        return self.start_velocity + change
+
+    @property
+    def start_velocity(self) -> FloatArray:
+        """Velocity before the step with the change that the integrator adds (nv,) [m/s, rad/s]."""
+        return (
+            self.velocity if self.velocity_change is None else self.velocity + self.velocity_change
+        )
 
     @property
     def own_velocity(self) -> FloatArray:
@@ -323,9 +334,9 @@ class StepRecord:
         assert self.acceleration is not None
         added = self.added_matrix
         if self.in_problem or not added.any():
-            return self.velocity + self.dt * self.acceleration
+            return self.start_velocity + self.dt * self.acceleration
         momentum = self.dt * self.mass @ self.acceleration
-        return self.velocity + np.linalg.solve(self.mass + added, momentum)
+        return self.start_velocity + np.linalg.solve(self.mass + added, momentum)
 
 
 def add_matrix(
@@ -477,7 +488,7 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
     order = places.astype(int)
     changed: dict[str, Any] = {}
     for name in ("velocity", "velocity_after", "coriolis", "force", "damping_force", "angular",
-                 "actuator_force", "integrator_force", "acceleration", "gravity_map"):  # fmt: skip
+                 "actuator_force", "integrator_force", "acceleration", "gravity_map", "velocity_change"):  # fmt: skip
         value = getattr(record, name)
         changed[name] = None if value is None else value[order]
     for name in (

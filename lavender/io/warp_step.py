@@ -1,8 +1,16 @@
-"""Read the last step of newton's `SolverMuJoCo` (MuJoCo Warp) as a `StepRecord`, and give records common names.
+"""Read the last step of newton's `SolverMuJoCo`, of MuJoCo Warp or of MJX as a `StepRecord`, and give common names.
 
 position, velocity = (x.numpy().copy() for x in (solver.mjw_data.qpos, solver.mjw_data.qvel))   # before the step
 solver.step(state_in, state_out, control, contacts, dt)
 record = lavender.io.step_from_newton_mujoco(solver, position, velocity)
+
+position, velocity = data.qpos.numpy().copy(), data.qvel.numpy().copy()
+mujoco_warp.step(warp_model, data)
+record = lavender.io.step_from_warp(model, data, position, velocity)
+
+after = mjx.step(mjx_model, before)
+record = lavender.io.step_from_mjx(model, before, after)
+
 record = lavender.io.align_step(record, other)           # names and order of another engine's record
 """
 
@@ -18,8 +26,9 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray, as_array, to_numpy
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.impedance import compute_impedance, measure_gap
+from lavender.io.mujoco import find_mover
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.mujoco_step import StepReader
+from lavender.io.mujoco_step import MODEL_TOLERANCE, StepReader, read_mass
 from lavender.io.newton_mujoco import NEWTON_ADVICE
 from lavender.io.step_record import ConstraintBlock, StepRecord, permute_velocities
 
@@ -36,6 +45,7 @@ CONTACT_ARRAYS = (
     "pos",
     "frame",
 )
+CONTACT_FRICTIONLESS = 5  # The smallest value of mjtConstraint of a contact.
 # [-] Rounding of float32 in R and in references, which are sums of large terms.
 FLOAT32_TOLERANCE = 1e-3
 
@@ -81,59 +91,224 @@ def step_from_newton_mujoco(
     before = as_array("position", to_numpy("position", position)[world], (model.nq,))
     moving = as_array("velocity", to_numpy("velocity", velocity)[world], (model.nv,))
     try:
-        reader = WarpReader(mj, model, data, before, moving, world)
-        after = data.qvel.numpy()[world].astype(float)
-        return reader.build(engine, after, "acceleration")
+        return _read_warp(mj, model, data, before, moving, world, engine)
     except AttributeError as error:
         raise CapabilityError(
             f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}"
         ) from None
 
 
-class WarpReader(StepReader):
-    """Arrays of one world of MuJoCo Warp after a step, with MuJoCo's kinematics of the state before it."""
+def step_from_warp(
+    model: Any,
+    data: Any,
+    position: Any,
+    velocity: Any,
+    *,
+    world: int = 0,
+    engine: str = "MuJoCo Warp",
+) -> StepRecord:
+    """Return the last step of MuJoCo Warp.
 
-    tolerance = FLOAT32_TOLERANCE
-    precision = "float32"
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        From which the engine's model was made.
+    data : mujoco_warp.Data
+        After `mujoco_warp.step`.
+    position, velocity : (n, nq), (n, nv)
+        `data.qpos` and `data.qvel` before the step, copied.
+    world : int, default 0
+    engine : str
+        Name in sentences.
+
+    Raises
+    ------
+    InputError
+        `model` is not a model of MuJoCo, or an array has another shape.
+    CapabilityError
+        The integrator is neither Euler nor implicitfast, or attributes of this version are missing.
+    """
+    mj = import_mujoco()
+    _check_model(mj, model)
+    if not hasattr(data, "efc") or not hasattr(data, "nacon"):
+        raise InputError(f"data is a {type(data).__name__}; the data of mujoco_warp are needed")
+    before = as_array("position", to_numpy("position", position)[world], (model.nq,))
+    moving = as_array("velocity", to_numpy("velocity", velocity)[world], (model.nv,))
+    try:
+        return _read_warp(mj, model, data, before, moving, world, engine)
+    except AttributeError as error:
+        raise CapabilityError(f"an attribute of these data is missing: {error}") from None
+
+
+def _check_model(mj: Any, model: Any) -> None:
+    """Raise an error unless the model is MuJoCo's, with an integrator that MJX and MuJoCo Warp have in common."""
+    if not isinstance(model, mj.MjModel):
+        raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
+    kinds = mj.mjtIntegrator
+    if int(model.opt.integrator) not in (int(kinds.mjINT_EULER), int(kinds.mjINT_IMPLICITFAST)):
+        raise CapabilityError(
+            "the integrator of this model is not Euler or implicitfast, which are supported"
+        )
+
+
+def _read_warp(
+    mj: Any, model: Any, data: Any, position: FloatArray, velocity: FloatArray, world: int, engine: str
+) -> StepRecord:  # fmt: skip
+    """Return the last step of one world of MuJoCo Warp's data."""
+    n = int(data.nefc.numpy()[world])
+    rows = {x: getattr(data.efc, x).numpy()[world][:n] for x in (*ROW_ARRAYS, "D", "vel")}
+    jac = data.efc.J.numpy()
+    if jac.ndim != 3 or jac.shape[1] < n or jac.shape[2] < model.nv:
+        raise CapabilityError("the Jacobian is sparse; set opt.jacobian of the solver to dense")
+    forces = {x: getattr(data, x).numpy()[world] for x in FORCES}
+    count = min(int(data.nacon.numpy()[0]), len(data.contact.dim))
+    contacts = {x: getattr(data.contact, x).numpy()[:count] for x in CONTACT_ARRAYS}
+    control, activation = (getattr(data, x).numpy()[world] for x in ("ctrl", "act"))
+    reader = ArrayReader(
+        mj, model, position, velocity, control, activation, rows | {"J": jac[world][:n]}, forces,
+        contacts, data.M.numpy()[world], "float32",
+    )  # fmt: skip
+    return reader.build(engine, data.qvel.numpy()[world].astype(float), "acceleration")
+
+
+def step_from_mjx(model: Any, before: Any, after: Any, *, engine: str = "MJX") -> StepRecord:
+    """Return a step of MJX in its implementation in JAX.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        From which the engine's model was made.
+    before, after : mujoco.mjx.Data
+        Argument and result of `mjx.step`, of one world.
+    engine : str
+        Name in sentences.
+
+    Raises
+    ------
+    InputError
+        `model` is not a model of MuJoCo, or the data are those of several worlds.
+    CapabilityError
+        The integrator is neither Euler nor implicitfast; the rows are not the ones of the model's constraints; or
+        attributes of this version are missing.
+    """
+    mj = import_mujoco()
+    _check_model(mj, model)
+    try:
+        inner = getattr(after, "_impl", after)
+        position, velocity = (np.asarray(getattr(before, x), float) for x in ("qpos", "qvel"))
+        if position.shape != (model.nq,) or velocity.shape != (model.nv,):
+            raise InputError(
+                f"qpos and qvel of before have shapes {position.shape} and {velocity.shape}; ({model.nq},) and "
+                f"({model.nv},) of one world are needed"
+            )
+        jac = np.asarray(inner.efc_J)
+        names = "pos", "margin", "aref", "force", "frictionloss", "D"
+        rows = {x: np.asarray(getattr(inner, f"efc_{x}")) for x in names}
+        rows |= {"J": jac, "vel": jac @ velocity, "type": np.asarray(inner.efc_type)}
+        contacts = {x: np.asarray(getattr(inner.contact, x)) for x in CONTACT_ARRAYS}
+        forces = {x: np.asarray(_get(after, inner, x)) for x in FORCES if x != "qfrc_damper"}
+        rows["id"] = _number_rows(mj, model, rows["type"], inner.contact)
+        if len(rows["type"]) != len(jac):
+            raise CapabilityError(
+                f"MJX has {len(jac)} rows for {len(rows['type'])} of the model's constraints, which is not supported"
+            )
+        # Rows of a constraint that is not active are 0; one row of an active one may be.
+        own = rows["type"] * (1 + rows["id"].max(initial=0)) + rows["id"]
+        used = np.isin(own, own[np.abs(jac).max(axis=1, initial=0.0) > 0.0])
+        is_single = jac.dtype == np.float32
+        reader = MjxReader(
+            mj, model, position, velocity, np.asarray(before.ctrl), np.asarray(before.act),
+            {k: x[used] for k, x in rows.items()}, forces, contacts, np.asarray(_get(after, inner, "M", "qM")),
+            "float32" if is_single else "float64",
+        )  # fmt: skip
+        moved_by = find_mover(mj, model, model.opt.integrator, False, False)
+        return reader.build(engine, np.asarray(after.qvel, float), moved_by)
+    except AttributeError as error:
+        raise CapabilityError(f"an attribute of these data is missing: {error}") from None
+
+
+def _get(data: Any, inner: Any, *names: str) -> Any:
+    """Return the first of some arrays that the data or their inner part have."""
+    for name in names:
+        for owner in (data, inner):
+            if hasattr(owner, name):
+                return getattr(owner, name)
+    raise AttributeError(" or ".join(names))
+
+
+def _number_rows(mj: Any, model: Any, kinds: IntArray, contact: Any) -> np.ndarray:
+    """Return the number of the constraint of each row of MJX, in its order."""
+    numbers: list[int] = []
+    types = mj.mjtEq
+    for kind, size in (("CONNECT", 3), ("WELD", 6), ("JOINT", 1), ("TENDON", 1)):
+        own = np.flatnonzero(model.eq_type == int(getattr(types, f"mjEQ_{kind}")))
+        numbers += np.repeat(own, size).tolist()
+    numbers += np.flatnonzero(model.dof_frictionloss > 0).tolist()
+    numbers += np.flatnonzero(model.tendon_frictionloss > 0).tolist()
+    limited = np.flatnonzero(model.jnt_limited)
+    is_ball = model.jnt_type[limited] == int(mj.mjtJoint.mjJNT_BALL)
+    numbers += [*limited[is_ball].tolist(), *limited[~is_ball].tolist()]
+    numbers += np.flatnonzero(model.tendon_limited).tolist()
+    result = np.full(len(kinds), -1, np.int64)
+    first = int(np.count_nonzero(kinds < CONTACT_FRICTIONLESS))
+    result[:first] = np.resize(numbers, first) if numbers else -1
+    for k, start in enumerate(np.asarray(contact.efc_address)):
+        dim = int(np.asarray(contact.dim)[k])
+        is_pyramid = dim > 1 and int(model.opt.cone) == int(mj.mjtCone.mjCONE_PYRAMIDAL)
+        result[start : start + (2 * (dim - 1) if is_pyramid else dim)] = k
+    return result
+
+
+class ArrayReader(StepReader):
+    """Arrays of another engine after a step, with MuJoCo's kinematics of the state before it.
+
+    Parameters
+    ----------
+    rows : dict of (m, ...) arrays
+        `ROW_ARRAYS`, J, D and vel of the constraint rows of the step.
+    forces : dict of (nv,) arrays
+        `FORCES`; MuJoCo's own where one is missing.
+    contacts : dict of (n, ...) arrays
+        `CONTACT_ARRAYS`; `efc_id` of a contact's row counts them.
+    """
 
     def __init__(
-        self, mj: Any, model: Any, data: Any, position: FloatArray, velocity: FloatArray, world: int
-    ) -> None:
+        self, mj: Any, model: Any, position: FloatArray, velocity: FloatArray, control: FloatArray,
+        activation: FloatArray, rows: Mapping[str, Any], forces: Mapping[str, Any],
+        contacts: Mapping[str, Any], mass: Any, precision: str,
+    ) -> None:  # fmt: skip
         self.mj, self.model = mj, model
         self.is_discrete = False
+        self.precision = precision
+        self.tolerance = FLOAT32_TOLERANCE if precision == "float32" else MODEL_TOLERANCE
         self.name_elements()
         host = self.host = mj.MjData(model)
         host.qpos[:], host.qvel[:] = position, velocity
         if model.nu:
-            host.ctrl[:] = data.ctrl.numpy()[world]
+            host.ctrl[:] = control
         if model.na:
-            host.act[:] = data.act.numpy()[world]
+            host.act[:] = activation
         mj.mj_forward(model, host)
-        n = int(data.nefc.numpy()[world])
-        rows = {f"efc_{x}": getattr(data.efc, x).numpy()[world][:n] for x in ROW_ARRAYS}
-        rows = {k: x.astype(int if k in ("efc_type", "efc_id") else float) for k, x in rows.items()}
-        jac = data.efc.J.numpy()
-        if jac.ndim != 3 or jac.shape[1] < n or jac.shape[2] < self.nv:
-            raise CapabilityError("the Jacobian is sparse; set opt.jacobian of the solver to dense")
-        self.jacobian = jac[world][:n, : self.nv].astype(float)
-        arrays = {x: getattr(data, x).numpy()[world].astype(float) for x in FORCES}
-        self.mass_values = data.M.numpy()[world].astype(float)
-        contacts = {x: getattr(data.contact, x).numpy() for x in CONTACT_ARRAYS}
-        count = int(data.nacon.numpy()[0])
+        self.mass_values = np.asarray(mass, float)
+        self.jacobian = np.asarray(rows["J"], float)[:, : self.nv]
+        integers = "type", "id"
+        named = {
+            f"efc_{x}": np.asarray(rows[x], int if x in integers else float) for x in ROW_ARRAYS
+        }
+        kinds = {k: np.asarray(x) for k, x in contacts.items()}
+        kinds = {k: x if x.dtype.kind == "i" else x.astype(float) for k, x in kinds.items()}
         contact = [
-            SimpleNamespace(
-                **{
-                    k: x[i] if x[i].dtype == np.int32 else x[i].astype(float)
-                    for k, x in contacts.items()
-                }
-            )
-            for i in range(min(count, len(contacts["dim"])))
+            SimpleNamespace(**{k: x[i] for k, x in kinds.items()}) for i in range(len(kinds["dim"]))
         ]
-        moving = data.efc.vel.numpy()[world][:n].astype(float)
         self.data = SimpleNamespace(
-            nefc=n, contact=contact, efc_R=1.0 / data.efc.D.numpy()[world][:n].astype(float),
-            efc_vel=moving, qpos=position, qvel=velocity, **rows, **arrays,
+            nefc=len(self.jacobian), contact=contact, efc_R=1.0 / np.asarray(rows["D"], float),
+            efc_vel=np.asarray(rows["vel"], float), qpos=position, qvel=velocity, **named,
+            **{x: np.asarray(forces.get(x, getattr(host, x)), float) for x in FORCES},
         )  # fmt: skip
+
+    def measure_added_matrix(self, mass: FloatArray) -> FloatArray:
+        """Return H (nv, nv) by MuJoCo's integrator with its own M, which is not rounded to float32."""
+        return super().measure_added_matrix(read_mass(self.mj, self.model, self.host))
 
     def read_mass(self) -> FloatArray:
         """Return M (nv, nv), which Warp stores as lower triangles in compressed rows, or densely."""
@@ -166,6 +341,19 @@ class WarpReader(StepReader):
     def read_forces_before_noslip(self, groups: Any) -> None:
         """Return None: Warp has no pass against slip."""
         return
+
+
+class MjxReader(ArrayReader):
+    """Arrays of MJX after a step."""
+
+    def measure_added_matrix(self, mass: FloatArray) -> FloatArray:
+        """Return H (nv, nv): of dampings and actuators, without MuJoCo's gyroscopic terms of free bodies."""
+        option, bits = self.model.opt, self.mj.mjtDisableBit
+        if int(option.integrator) != int(self.mj.mjtIntegrator.mjINT_EULER):
+            return self.dt * (self.read_damping() + self.read_actuator_matrix())
+        is_explicit = int(option.disableflags) & int(bits.mjDSBL_EULERDAMP)
+        dampings = np.diag(np.array(self.model.dof_damping, float))
+        return self.dt * (0.0 if is_explicit else 1.0) * dampings
 
 
 def align_step(record: StepRecord, like: StepRecord) -> StepRecord:

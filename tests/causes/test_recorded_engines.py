@@ -63,3 +63,51 @@ def test_align_step_gives_names_and_order_of_another_record():
     assert not lv.compare(record, again).difference.any()
     with pytest.raises(lv.InputError, match="unique"):
         lv.io.align_step(record, lv.io.permute_velocities(record, order, tuple("abcdefgh")))
+
+
+#: Model -> options of Genesis 1.4.5 in float64 that were switched, with the ingredient that each one sets.
+SWITCHED = {"timeconst": "softness", "Euler": "integrator", "both": "softness integrator"}
+
+
+def load_genesis(model, name=""):
+    return lv.io.load_step(FOLDER / f"{model}_genesis_1.4.5{'_' * bool(name)}{name}.npz")
+
+
+@pytest.mark.parametrize("model", ["gripper", "arm", "sliding"])
+def test_mixture_of_genesis_equals_genesis_with_just_that_switched(model):
+    """constraint_timeconst 0.01 and 0.03 s, integrator approximate_implicitfast and Euler."""
+    own = load_genesis(model)
+    found = lv.compare(own, load_genesis(model, "both"))
+    size = max(1.0, np.abs(own.velocity_after).max())
+    for name, exchanged in SWITCHED.items():
+        bits = tuple(x in exchanged.split() for x in found.active)
+        switched = load_genesis(model, name).velocity_after
+        # Two exact solutions in float64, of velocities of this size.
+        np.testing.assert_allclose(
+            found.mixtures[bits].velocity, switched, rtol=0, atol=1e-13 * size
+        )
+    for name in ("solver", "lost digits", "rest", "state"):
+        assert np.abs(found.parts[name].mean).max() < 1e-13 * size
+    assert set(found.active) == {"softness", "integrator"}
+    assert np.abs(found.parts["softness"].mean).max() > 1e-2
+
+
+def test_arm_of_genesis_and_mujoco_differs_by_settings_that_the_text_names():
+    """Genesis has no limits of ball joints, adds an armature of 0.1 to the elbow, and replaces a missing solref."""
+    found = lv.compare(lv.io.load_step(FOLDER / "arm_mujoco_4.0.0.npz"), load_genesis("arm"))
+    text = str(found)
+    assert "mass of elbow: 0.06996 and 0.17 kg m2" in text
+    assert "1 limit only MuJoCo has: limit of wrist" in text
+    assert "Genesis uses constraint_timeconst=0.01 where the file gives no solref" in text
+    assert "constraint_timeconst=0.02" in found.proposals[0].text
+    np.testing.assert_allclose(
+        sum(p.mean for p in found.parts.values()), found.difference, rtol=0, atol=1e-12
+    )
+
+
+def test_tumbling_box_of_genesis_follows_the_midpoint_rule():
+    """The box has its centre of mass at its joint; the rod beside it does not, and leaves a rest."""
+    record = load_genesis("tumble")
+    rest = record.velocity_after - record.own_velocity
+    assert record.velocity_change is not None and np.abs(record.velocity_change[:6]).max() > 1e-5
+    assert np.abs(rest[:6]).max() < 1e-13 < 1e-5 < np.abs(rest[6:]).max()
