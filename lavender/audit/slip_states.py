@@ -204,7 +204,7 @@ class SlipOfStates:
         sentences = [" ".join(self.sentences), *filter(None, [advice])]
         footer = [
             *filter(None, [self.left_out]),
-            "Files: forces.csv (contacts of all states), numbers.json, figures/ (PDF, SVG, PNG)."
+            "Files: forces.csv (contacts of all states), numbers.json, figures/ (PDF, SVG, PNG).",
         ]
         return Page(
             "lavender slip",
@@ -388,7 +388,9 @@ def _simulate_remedies(
     )
     change = f"less than {100.0 * MIN_CHANGE:.0f} %"
     names = "; ".join(idle)
-    return f"Not simulated, because it changes the fastest step by {change}: {names}." if idle else ""
+    return (
+        f"Not simulated, because it changes the fastest step by {change}: {names}." if idle else ""
+    )
 
 
 def _get_uses(explanation: SlipExplanation) -> FloatArray:
