@@ -105,8 +105,8 @@ STRUCTURES: dict[
     "dense": (draw_dense, (5, 30, 100, 300)),
     "dense, singular P": (draw_least_squares, (40,)),
     "linear": (draw_linear, (30, 100)),
-    "bounds, sparse": (draw_bounds, (300, 3000)),
-    "sparse": (draw_sparse, (300, 2000)),
+    "bounds, sparse": (draw_bounds, (300, 1000)),
+    "sparse": (draw_sparse, (300, 1000)),
     "control": (draw_control, (160, 1600)),
 }
 

@@ -1,7 +1,7 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
     python docs/generate.py            write docs/generated/, as the Sphinx build does
-    python docs/generate.py --pages    rewrite solvers.md and the table of scenes in engine.md
+    python docs/generate.py --pages    rewrite solvers.md and the tables of engine.md and quadratic-programs.md
     python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md, and the
                                        figures in docs/static/examples/
 
@@ -17,8 +17,10 @@ import importlib.util
 import inspect
 import io
 import itertools
+import json
 import os
 import re
+import statistics
 import sys
 import tempfile
 import warnings
@@ -53,6 +55,7 @@ FIGURES = (
     "planned_push",
     "residual_or_motion",
     "motion_over_a_run",
+    "inverse_kinematics",
 )
 TOLERANCES = (1e-3, 1e-6, 1e-9)
 CASES = (
@@ -434,6 +437,53 @@ def tabulate_backends(specs):
         )
     seen = table(("backend", "method", "wrong", "fails"), rows)
     return f"{seen}\n\nNot observed: {join_names(unseen)}."
+
+
+def tabulate_programs(lines):
+    """Return the table of QP solvers by size and structure, and the errors of backends alone."""
+    times = {}
+    missed = {}
+    alone = {}
+    for line in lines:
+        program = (line["structure"], line["n"])
+        of = times.setdefault(program, {})
+        if line["found"]:
+            of.setdefault(line["solver"], []).append(line["time"])
+        elif line["accepted"]:
+            missed.setdefault(program, set()).add(line["solver"])
+        if line["alone"] is not None:
+            alone.setdefault(line["solver"], []).append(line["alone"])
+    rows = []
+    slow = []
+    for program, of in times.items():
+        medians = {name: statistics.median(t) for name, t in of.items()}
+        best = min(medians.values())
+        groups = ([], [], [])  # Up to 2, 10 and more times the fastest.
+        for name in sorted(medians, key=medians.__getitem__):
+            ratio = medians[name] / best
+            groups[0 if ratio <= 2.0 else 1 if ratio <= 10.0 else 2].append(name)
+        groups[2].extend(sorted(missed.get(program, set()) - set(medians)))
+        name, *others = groups[0]
+        structure, n = program
+        if medians["auto"] > 2.0 * best:
+            slow.append(f"{structure} {n} ({medians['auto'] / best:.0f} times)")
+        cells = (f"**{name}** {format_seconds(best)}", *map(", ".join, (others, *groups[1:])))
+        rows.append((structure, n, *cells))
+    head = (
+        "program",
+        "variables",
+        "fastest",
+        "up to 2 times",
+        "up to 10 times",
+        "more, or not found",
+    )
+    errors = sorted(alone.items(), key=lambda item: max(item[1]))
+    text = ", ".join(f"{name} {max(e):.0e}".replace("e-0", "e-") for name, e in errors)
+    text = (
+        f"Alone, at default settings, x differs by up to (relative to its largest entry): {text}."
+    )
+    late = f"`auto` takes more than twice the time of the fastest on: {', '.join(slow)}."
+    return f"{table(head, rows)}\n\n{late}\n\n{text}"
 
 
 # Paragraphs of the page of backends in the built documentation.
@@ -855,6 +905,10 @@ def committed_pages():
     pages = {"solvers.md": solver_overview()}
     text = (Path(__file__).resolve().parent / "engine.md").read_text(encoding="utf-8")
     pages["engine.md"] = fill_tables(text, {"scenes": tabulate_scenes()})
+    text = (Path(__file__).resolve().parent / "quadratic-programs.md").read_text(encoding="utf-8")
+    record = Path(__file__).resolve().parent / "static" / "backends.json"
+    lines = json.loads(record.read_text(encoding="utf-8"))["lines"]
+    pages["quadratic-programs.md"] = fill_tables(text, {"backends": tabulate_programs(lines)})
     return {name: text.rstrip() + "\n" for name, text in pages.items()}
 
 

@@ -263,22 +263,20 @@ def make_settings_file():
 
 
 def make_reason_table():
-    """Return the reasons of the classes' limits."""
-    lines = [
-        (name, ", ".join(f"{x:g}" for x in s.limits) + f" {s.unit}", s.reason)
-        for name, s in SCENES.items()
-    ]
-    return markdown(("scene", "good, fair, poor up to", "reason"), lines)
+    """Return the reasons of the classes' limits, one line for the scenes with the same."""
+    scenes = {}
+    for name, s in SCENES.items():
+        limits = ", ".join(f"{x:g}" for x in s.limits) + f" {s.unit}"
+        scenes.setdefault((limits, s.reason), []).append(name)
+    lines = [(", ".join(names), *key) for key, names in scenes.items()]
+    return markdown(("scenes", "good, fair, poor up to", "reason"), lines)
 
 
 def make_missing_table(rows):
     """Return the engines that were tried and are not in the table, and rows without cells."""
-    waiting = [
-        (ENGINES[name].title, "has an adapter and settings; not all of its cells have been run")
-        for name in ENGINES
-        if name not in get_engines(rows)
-    ]
-    return markdown(("engine", "reason"), [*waiting, *NOT_RUN.items()])
+    waiting = [ENGINES[name].title for name in ENGINES if name not in get_engines(rows)]
+    line = (", ".join(waiting), "adapters and settings exist; not all cells have been run")
+    return markdown(("engine", "reason"), [line, *NOT_RUN.items()])
 
 
 def join_names(names, rows):

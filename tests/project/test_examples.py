@@ -243,6 +243,20 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
     assert "hinge" not in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # of osqp
+def test_backends_leave_the_path_of_an_arm_alone_and_keep_it_through_lavender(drawn):
+    """The figures of quadratic-programs.md; backends alone differ between versions, by less than a factor of two."""
+    pytest.importorskip("quadprog")
+    found = drawn("inverse_kinematics").numbers()
+    page = (DOCS / "quadratic-programs.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"leaves quadprog's path by .*?`lavender.qp.solve_qp`", page, re.DOTALL)
+    osqp, others, through = (float(number) for number in re.findall(r"([\d.e-]+) rad", text))
+    for name, distances in found.items():
+        told = osqp if name == "osqp" else others
+        assert 0.5 * told < distances["alone"].max() < 2.0 * told, name
+        assert distances["lavender"].max() < through, name
+
+
 def read_left_over(folder):
     """Return the velocities without a cause of the recorded steps [m/s]."""
     return [
