@@ -164,11 +164,11 @@ class ConvexProgram:
         """Yield points with entries at 0 or at a bound that differ from these by rounding of the largest x_j / D_j.
 
         A local error compares a variable with its own size, so that the rounding of large variables counts
-        in small ones.
+        in small ones. If all entries are rounding of 0, the size sigma of x takes the place of the largest one.
         """
         low, high = self._bounds
-        d = self.scales[0]
-        size = d * np.abs(x / d).max(initial=0.0)
+        d, _, sigma, _ = self.scales
+        size = d * max(np.abs(x / d).max(initial=0.0), sigma)
         last = x
         for share in ROUNDED_SHARES:
             y = np.where(np.abs(x) <= share * size, 0.0, x)
