@@ -17,12 +17,13 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof, prove_infeasibility
 from lavender.problem import Problem
 from lavender.programs.convex import ConvexProgram
-from lavender_ext.program.error import MIN_PROOF_SHARE
+from lavender_ext.program.error import MAX_TERM_GROWTH, MIN_PROOF_SHARE, TERM_ROUNDING
 
 RAY_TOLERANCE = 1e-8  # [-] P d, J d and q.d count as 0 up to this multiple of their largest terms.
-FEASIBLE_TOLERANCE = (
-    1e-6  # [-] Largest error of a row of the feasible point of an unbounded program.
-)
+# [-] Largest violation of a row by the feasible point of an unbounded program, as a multiple of its right-hand side.
+FEASIBLE_TOLERANCE = 1e-6
+# Linear programs for a feasible point, each for the violations that the last one left.
+FEASIBLE_STEPS = 3
 # Matrices of more rows or columns are projected by a sparse factor with this shift, which repetitions remove.
 MAX_DENSE_PROJECTION, PROJECTION_SHIFT, PROJECTIONS = 100, 1e-10, 3
 # [-] t.lambda of a proof is positive by more than this multiple of the sum of |lambda| in scaled units; the rest is
@@ -111,11 +112,14 @@ def _search_rows(
                 return proof
         if attempt or deadline.has_passed():
             break
-        high = 1.0 if scaled.is_kept is None else scaled.is_kept.astype(float)
         matrix = scaled.jacobian.T
+        # A row without coefficients is violated, which is a proof itself, or has no part in one.
+        high = (np.asarray(abs(matrix).sum(axis=0)).ravel() > 0.0).astype(float)
+        if scaled.is_kept is not None:
+            high *= scaled.is_kept
         t = scaled.t * high
         found = _solve_linear_program(
-            -t, matrix, None, np.where(is_equation, -1.0, 0.0), high, deadline
+            -t, matrix, None, np.where(is_equation, -high, 0.0), high, deadline
         )
         if found is None:
             return None
@@ -131,8 +135,10 @@ def find_ray(
     x: FloatArray | None,
     deadline: Deadline,
     tolerances: tuple[tuple[float, float], ...] = ((RAY_TOLERANCE, RAY_TOLERANCE),),
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,) of an unbounded program, or None.
+) -> tuple[FloatArray, FloatArray | None] | None:
+    """Return a ray d (n,) with a largest entry of 1 and a feasible point (n,), or None without a ray.
+
+    The program is unbounded if it has both. With a ray alone, it has no solution, whatever the point.
 
     A ray of one component is a ray of the program. All components are searched by one linear program,
     in which each has its own units of the cost, and each direction is checked alone.
@@ -142,7 +148,7 @@ def find_ray(
     tolerances : tuple of (level, slope)
         Largest P d and J d, and smallest -q.d, as multiples of their terms; one pair must hold.
     """
-    scaled, (scale, _, sigma, _) = program.scaled, program.scales
+    scaled, scale = program.scaled, program.scales[0]
     n, free = scaled.n, program.free
     hessian, jac = scaled.hessian, scaled.jacobian
     part, count = program.components
@@ -175,21 +181,37 @@ def find_ray(
     ray = np.zeros(n)
     ray[columns] = direction
     if x is None or not _is_feasible(program, x):
-        if deadline.has_passed():
-            return None
-        none = np.full(n, np.inf)
-        sizes = np.minimum(_get_sizes(scaled.t, row_part, count), 1.0)
-        t = scaled.t / sizes[row_part]
-        found = _solve_linear_program(
-            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, t[:free], t[free:]
-        )
-        if found is None:
-            return None
-        x = found * sizes[column_part] * (scale * sigma)
-        if not _is_feasible(program, x):
-            return None
+        x = _find_feasible_point(program, deadline)
     ray = ray * scale
     return ray / np.abs(ray).max(), x
+
+
+def _find_feasible_point(program: ConvexProgram, deadline: Deadline) -> FloatArray | None:
+    """Return a feasible point (n,) or None, by linear programs for what the last one left, in units of that.
+
+    Each component has its own units.
+    """
+    scaled, (scale, _, sigma, _) = program.scaled, program.scales
+    n, free, jac = scaled.n, scaled.free, scaled.jacobian
+    part, count = program.components
+    column_part, row_part = part[:n], part[n:]
+    none = np.full(n, np.inf)
+    x = np.zeros(n)
+    for _ in range(FEASIBLE_STEPS):
+        rest = scaled.t - jac @ x
+        violated = np.where(np.arange(len(rest)) < free, np.abs(rest), np.maximum(rest, 0.0))
+        sizes = np.minimum(_get_sizes(violated, row_part, count), 1.0)
+        rest = np.maximum(rest / sizes[row_part], -1.0 / FEASIBLE_TOLERANCE**2)
+        found = _solve_linear_program(
+            np.zeros(n), jac[:free], jac[free:], -none, none, deadline, rest[:free], rest[free:]
+        )
+        if found is None or deadline.has_passed():
+            return None
+        x += found * sizes[column_part]
+        point: FloatArray = x * (scale * sigma)
+        if _is_feasible(program, point):
+            return point
+    return None
 
 
 def _find_component_ray(
@@ -226,8 +248,17 @@ def _get_sizes(values: FloatArray, part: Any, count: int) -> FloatArray:
 
 
 def _is_feasible(program: ConvexProgram, x: FloatArray) -> bool:
-    """Return whether x satisfies the rows of the program, by the judge of programs without a cost."""
-    return bool(program.without_cost().judge(x, np.zeros(len(program.t)))[2] <= FEASIBLE_TOLERANCE)
+    """Return whether x satisfies each row to FEASIBLE_TOLERANCE of its right-hand side, or of its terms if that is 0.
+
+    Large x makes the rows of contradicting constraints hold relative to their terms, of which only rounding counts.
+    """
+    side = np.abs(program.t)
+    violation = program.jacobian @ x - program.t
+    violation[: program.free] = -np.abs(violation[: program.free])
+    terms = abs(program.jacobian) @ np.abs(x) + side
+    rounding = np.where(terms > MAX_TERM_GROWTH * side, 0.0, TERM_ROUNDING * terms)
+    limit = FEASIBLE_TOLERANCE * np.where(side > 0.0, side, terms) + rounding
+    return bool((-violation <= limit).all())
 
 
 def _project_to_kernel(x: FloatArray, matrix: Any) -> FloatArray:

@@ -63,6 +63,12 @@ class ProgramTask:
         """The constraint problem, which a backend does not need."""
         return Problem(**self.qp.problem_fields(), qp=self.qp) if self.given is None else self.given
 
+    @cached_property
+    def problem_without_cost(self) -> Problem:
+        """The constraint problem with q = 0, in which proofs that no x satisfies the rows are checked."""
+        qp = self.qp.with_vectors(q=np.zeros(len(self.qp.q)))
+        return Problem(**qp.problem_fields(), qp=qp)
+
     @property
     def impulse(self) -> FloatArray:
         """The impulses (m,) of the best point, or x and the multipliers (n + m,) if P is singular."""
@@ -124,7 +130,7 @@ class ProgramTask:
             if self._has_near_solution():
                 return
             self.proof = self.proof or find_infeasibility_proof(
-                self.problem,
+                self.problem_without_cost,
                 self.program,
                 judge.x,
                 judge.tol,
@@ -146,7 +152,7 @@ class ProgramTask:
             row = rows[np.argmax(np.abs(qp.target[rows]))]
             y = np.zeros(self.problem.m)
             y[self.problem.m - len(qp.target) + row] = np.sign(qp.target[row])
-            proof = prove_infeasibility(self.problem, y)
+            proof = prove_infeasibility(self.problem_without_cost, y)
             # J^T y = 0 and t.y > 0 hold exactly, however small t is beside other rows.
             self.proof = Proof(y, math.inf) if proof.reason else proof
         return len(rows) > 0
@@ -157,12 +163,24 @@ class ProgramTask:
         return TERM_ROUNDING, max(self.judge.tol, TERM_ROUNDING)
 
     def _search_ray(self, *tolerances: tuple[float, float]) -> None:
-        """Search for a ray and a feasible point."""
+        """Search for a ray and a feasible point; with a ray alone, the best point is no solution."""
         found = find_ray(self.program, self.judge.x, self.deadline, tolerances)
-        if found is not None:
-            self.ray = mark_read_only(found[0])
-            self.judge.x = found[1]
-            self.judge.lam = np.zeros(len(self.qp.target))
+        if found is None:
+            return
+        ray, x = found
+        none = np.zeros(len(self.qp.target))
+        if x is None:
+            # No optimum exists: a point is judged without multipliers, with which large x looks like one.
+            for point in (self.judge.x, np.zeros(len(ray))):
+                judge = ProgramJudge(self.program, self.judge.tol, self.deadline)
+                assert point is not None
+                judge.keep(point, none)
+                if judge.error > judge.tol:
+                    break
+            self.judge = judge
+            return
+        self.ray = mark_read_only(ray)
+        self.judge.x, self.judge.lam = x, none
 
     def _has_near_solution(self) -> bool:
         """Whether a Newton step from the best point meets tol strictly, so that no proof or ray is to be searched for.

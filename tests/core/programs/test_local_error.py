@@ -5,6 +5,9 @@ import pytest
 
 import lavender as lv
 from benchmarks.programs import solve_exactly
+from lavender.base import deadline
+from lavender.programs.forms import get_program
+from lavender.programs.proofs import find_ray
 
 SEEDS = range(40)
 POWERS = range(31)
@@ -342,3 +345,58 @@ def test_rows_with_a_right_hand_side_of_0_hide_no_contradiction(solver, total):
     )
     assert not answer.found
     assert answer.solution.status is lv.Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("power", [20, 40, 50, 60])
+@pytest.mark.parametrize("solver", ["auto", "clarabel", "piqp", "osqp"])
+def test_program_without_a_feasible_point_is_not_unbounded(power, solver):
+    """x_0 + x_1 = 0 and = 1 beside a connected sum of 2^power, and a cost that falls without end."""
+    pytest.importorskip("piqp" if solver == "auto" else solver)
+    A = [[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0]]
+    problem = lv.Problem.from_qp(
+        np.zeros((4, 4)), [0, 0, 0, -1.0], [[0, 0, 1.0, -1.0]], [0.0], A, [0.0, 1.0, 2.0**power]
+    )
+    for x in (None, [0.0, 0.0, 2.0**power, 2.0**power], [-(2.0**power), 2.0**power, 0.0, 0.0]):
+        start = None if x is None else np.array(x)
+        found = find_ray(get_program(problem.qp), start, deadline.NEVER)
+        assert found is None or found[1] is None
+    answer = lv.solve_qp(problem, solver)
+    assert not answer.found
+    assert answer.solution.status is not lv.Status.UNBOUNDED
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("solver", ["auto", "clarabel", "piqp", "osqp"])
+def test_solution_0_of_rows_with_right_hand_sides_of_0_is_found(seed, solver):
+    """All entries of a backend's x are rounding, in units of rows and variables of 2^-20 to 2^20."""
+    pytest.importorskip("piqp" if solver == "auto" else solver)
+    rng = np.random.default_rng(seed)
+    n, m = rng.integers([2, 4], [6, 9])
+    root, G = rng.integers(-2, 3, (n, n)), rng.integers(-3, 4, (m, n))
+    z = rng.integers(0, 3, m) + (np.arange(m) == 0)
+    units, sides = 2.0 ** rng.integers(-20, 21, n), 2.0 ** rng.integers(-20, 21, m)
+    P = (root.T @ root) * np.outer(units, units)
+    answer = lv.solve_qp(
+        P, -(G.T @ z) * units, G * units * sides[:, None], np.zeros(m), solver=solver
+    )
+    assert answer.found
+
+
+@pytest.mark.parametrize("solver", ["auto", "clarabel", "piqp", "newton"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_costs_have_no_part_in_a_proof_that_no_point_is_feasible(seed, solver):
+    """A sum of rows contradicts another row; costs of some variables are 1e8 times those of others."""
+    if solver in ("clarabel", "piqp"):
+        pytest.importorskip(solver)
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 7))
+    G, h = rng.integers(-3, 4, (n, n)), rng.integers(-20, 21, n)
+    q = rng.integers(-9, 10, n) * 1e8 ** rng.integers(0, 2, n)
+    rows, sides = np.vstack([G, -G.sum(axis=0)]), np.append(h, -h.sum() - 1)
+    # A row without coefficients, which holds, may have any multiplier.
+    answer = lv.solve_qp(np.eye(n), q, rows, sides, np.zeros((1, n)), [0.0], solver=solver)
+    assert answer.solution.status is lv.Status.INFEASIBLE
+    _, z, _ = answer.qp.multipliers(answer.solution.certificate)
+    assert (z >= 0.0).all()
+    assert z @ sides < 0.0
+    assert np.abs(rows.T @ z).max() <= 2.0**-46 * (np.abs(rows).T @ z).max()  # Rounding of sums.
