@@ -36,7 +36,7 @@ MAX_REPEATED_TIME = 0.3  # [s] Solves that took longer are not repeated.
 
 
 def draw_dense(n: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Return a dense program: n inequalities, of which about a third are active, and n // 10 equations."""
+    """Return a dense program: n inequalities, and n // 10 equations."""
     root = rng.normal(size=(n, n)) / math.sqrt(n)
     G, A = rng.normal(size=(n, n)), rng.normal(size=(n // 10, n))
     x = rng.normal(size=n)

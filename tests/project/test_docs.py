@@ -282,6 +282,25 @@ def test_readme_has_the_numbers_of_its_figure():
         assert part in text, part
 
 
+def test_readme_has_the_programs_on_which_auto_is_slow():
+    record = json.loads((ROOT / "docs" / "static" / "backends.json").read_text(encoding="utf-8"))
+    times = {}
+    for line in record["lines"]:
+        if line["found"]:
+            program = times.setdefault((line["structure"], line["n"]), {})
+            program.setdefault(line["solver"], []).append(line["time"])
+    slow = {}
+    for (structure, _), solvers in times.items():
+        medians = {name: np.median(seconds) for name, seconds in solvers.items()}
+        best = min(medians, key=medians.__getitem__)
+        if medians["auto"] > 2.0 * medians[best]:
+            slow.setdefault((structure, best), []).append(medians["auto"] / medians[best])
+    assert list(slow) == [("bounds, sparse", "piqp")]
+    ((few, many),) = slow.values()
+    row = f"| sparse programs with bounds alone | PIQP | **{few:.0f} to {many:.0f}** |"
+    assert row in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
 def test_readme_counts_the_solvers_that_are_registered():
     specs = lv.registry.specs().values()
     own = sum(spec.builtin and not spec.external for spec in specs)
