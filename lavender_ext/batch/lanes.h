@@ -84,10 +84,13 @@ LAVENDER_VECTOR(2, lanes_2, mask_2)
 #define OF_WORLDS 0
 #include "lanes_body.h"
 
-#ifdef __x86_64__
-#include <immintrin.h>
+/* With LAVENDER_GENERIC_LANES the compiler makes all widths of the instructions that every processor has. */
+#if defined(__x86_64__) || defined(LAVENDER_GENERIC_LANES)
 LAVENDER_VECTOR(4, lanes_4, mask_4)
 LAVENDER_VECTOR(8, lanes_8, mask_8)
+#endif
+#if defined(__x86_64__) && !defined(LAVENDER_GENERIC_LANES)
+#include <immintrin.h>
 
 #define LANE(f) f##_2
 #define WIDTH 2
@@ -141,22 +144,69 @@ LAVENDER_VECTOR(8, lanes_8, mask_8)
 #define LAVENDER_IN_LANES(width, name, arguments) \
     ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
 #else
+#define LAVENDER_ROOT_AND_ANY(N, V, I) \
+    static inline V roots_##N(V a) { \
+        for (int i = 0; i < N; i++) a[i] = sqrt(a[i]); \
+        return a; \
+    } \
+    static inline int some_##N(I mask) { \
+        long long bits = 0; \
+        for (int i = 0; i < N; i++) bits |= mask[i]; \
+        return bits != 0; \
+    }
+LAVENDER_ROOT_AND_ANY(2, lanes_2, mask_2)
+
 #define LANE(f) f##_2
 #define WIDTH 2
 #define V lanes_2
 #define I mask_2
 #define ISA
-#define ROOT(a) ((lanes_2){sqrt((a)[0]), sqrt((a)[1])})
+#define ROOT(a) roots_2(a)
 #define PICK LAVENDER_PICK
 #define ABS LAVENDER_ABS
-#define ANY(mask) (((mask)[0] | (mask)[1]) != 0)
+#define ANY(mask) some_2(mask)
 #define OF_WORLDS 1
 #include "lanes_body.h"
 
 #define lavender_solve_one(x, wide) solve_1(x)
+#ifdef LAVENDER_GENERIC_LANES
+LAVENDER_ROOT_AND_ANY(4, lanes_4, mask_4)
+LAVENDER_ROOT_AND_ANY(8, lanes_8, mask_8)
+
+#define LANE(f) f##_4
+#define WIDTH 4
+#define V lanes_4
+#define I mask_4
+#define ISA
+#define ROOT(a) roots_4(a)
+#define PICK LAVENDER_PICK
+#define ABS LAVENDER_ABS
+#define ANY(mask) some_4(mask)
+#define OF_WORLDS 1
+#include "lanes_body.h"
+
+#define LANE(f) f##_8
+#define WIDTH 8
+#define V lanes_8
+#define I mask_8
+#define ISA
+#define ROOT(a) roots_8(a)
+#define PICK LAVENDER_PICK
+#define ABS LAVENDER_ABS
+#define ANY(mask) some_8(mask)
+#define OF_WORLDS 1
+#include "lanes_body.h"
+
+#define LAVENDER_IN_LANES(width, name, arguments) \
+    ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
+#define LAVENDER_FEWEST_LANES 8
+#else
 #define LAVENDER_IN_LANES(width, name, arguments) name##_2 arguments
 #endif
+#endif
+#ifndef LAVENDER_FEWEST_LANES
 #define LAVENDER_FEWEST_LANES 2
+#endif
 #else
 #define LANE(f) f##_1
 #define WIDTH 1

@@ -58,7 +58,7 @@ cdef enum:
 
 cdef inline int32_t count_lanes() noexcept nogil:
     """Return the number of lanes of this processor's widest instructions."""
-    return 8 if has_wide() == 2 else 4 if has_wide() == 1 else FEWEST_LANES
+    return max(FEWEST_LANES, 8 if has_wide() == 2 else 4 if has_wide() == 1 else 1)
 
 
 cdef inline bint fits_lanes(const blocks_t* p, int32_t i) noexcept nogil:
