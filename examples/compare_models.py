@@ -2,7 +2,8 @@
 
 Converters of URDF files lose values without a message. `lavender audit` judges the steps of the model that it gets, so
 compare first. The two arguments are any files that MuJoCo reads, for example a URDF and the MJCF file made from it;
-without arguments, a pendulum is compared with the same pendulum without its friction loss and its limit of effort.
+without arguments, a pendulum is compared with the same pendulum without its friction loss, its limit of effort and the
+gear of its motor.
 
     python examples/compare_models.py robot.urdf converted.xml
 """
@@ -12,7 +13,8 @@ import sys
 import numpy as np
 
 PENDULUM = """<mujoco><worldbody><body name="arm"><joint name="hinge" damping="0.5" {}/>
-<geom type="sphere" size="0.1" pos="0 0 -1"/></body></worldbody></mujoco>"""
+<geom type="sphere" size="0.1" pos="0 0 -1"/></body></worldbody>
+<actuator><motor joint="hinge" gear="{}"/></actuator></mujoco>"""
 
 
 def read_joints(model):
@@ -21,15 +23,18 @@ def read_joints(model):
     for i in np.flatnonzero(model.jnt_type >= 2):
         dof = model.jnt_dofadr[i]
         effort = model.jnt_actfrcrange[i, 1] if model.jnt_actfrclimited[i] else np.inf
-        drives = (
-            (model.actuator_trntype == 0)
-            & (model.actuator_trnid[:, 0] == i)
-            & (model.actuator_forcelimited > 0)
-        )
+        own = (model.actuator_trntype == 0) & (model.actuator_trnid[:, 0] == i)
+        limited = own & (model.actuator_forcelimited > 0)
+        limits = model.actuator_forcerange[:, 1] * model.actuator_gear[:, 0]
+        # The force on the joint per unit of control, of each actuator.
+        gains = model.actuator_gainprm[own, 0] * model.actuator_gear[own, 0]
         joints[model.joint(i).name] = {
             "damping": model.dof_damping[dof],
             "friction": model.dof_frictionloss[dof],
-            "effort": min([effort, *model.actuator_forcerange[drives, 1]]),
+            "stiffness": float(np.ravel(model.jnt_stiffness[i])[0]),
+            "armature": model.dof_armature[dof],
+            "force per control": tuple(map(float, gains)),
+            "effort": min([effort, *limits[limited]]),
             "limits": tuple(map(float, model.jnt_range[i])) if model.jnt_limited[i] else "none",
         }
     return joints
@@ -60,7 +65,8 @@ def main():
     if len(paths) == 2:
         compare(*(mujoco.MjModel.from_xml_path(path) for path in paths))
     else:
-        texts = PENDULUM.format('frictionloss="0.2" actuatorfrcrange="-30 30"'), PENDULUM.format("")
+        lost = 'frictionloss="0.2" actuatorfrcrange="-30 30"'
+        texts = PENDULUM.format(lost, 50), PENDULUM.format("", 1)
         compare(*(mujoco.MjModel.from_xml_string(text) for text in texts))
 
 

@@ -107,6 +107,37 @@ def drake_drops_geoms_in_frames():
 
 
 @fact(
+    *DRAKE,
+    "MJCF: `gear`",
+    "The gear of a motor scales the inertia of its rotor, not its torque: a control of 1 with gear 50 is 1 N m, and a "
+    "`ctrlrange` of 2 limits the torque to 2 N m; in MuJoCo they are 50 and 100 N m. There is no warning.",
+    "`from_drake` reads the torque that acts.",
+)
+def drake_drops_gear_of_torque():
+    from pydrake.all import MultibodyPlant, Parser, Simulator
+
+    mjcf = (
+        '<mujoco model="m"><option gravity="0 0 0"/><worldbody><body name="b">'
+        '<joint name="j" axis="0 1 0" armature=".01"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia=".02 .02 .02"/></body></worldbody>'
+        '<actuator><motor name="a" joint="j" gear="50" ctrlrange="-2 2"/></actuator></mujoco>'
+    )
+    plant = MultibodyPlant(0.001)
+    Parser(plant).AddModelsFromString(mjcf, "xml")
+    plant.Finalize()
+    simulator = Simulator(plant)
+    context = simulator.get_mutable_context()
+    plant.get_actuation_input_port().FixValue(context, [1.0])
+    simulator.AdvanceTo(0.1)
+    (actuator,) = (plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices())
+    return (
+        np.isclose(plant.CalcMassMatrix(context)[0, 0], 0.03)
+        and np.isclose(plant.GetVelocities(context)[0], 0.1 / 0.03)
+        and actuator.effort_limit() == 2.0
+    )
+
+
+@fact(
     *NEWTON,
     "MJCF: `fromto` of a box, `settotalmass`",
     "A box by `fromto` is a cube of its `size` in the origin of the body: 0.5 kg in place of 2 kg. `settotalmass` "
