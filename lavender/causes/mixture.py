@@ -90,6 +90,44 @@ def solve_mixture(
     velocity : (nv,), optional
         Velocity before the step. Default: the one of the source of the rows.
     """
+    step = assemble(sources, pairing, velocity)
+    if step.problem is None:
+        return Mixture(step.free, 0.0, True)
+    best = None
+    for solver in SOLVERS:
+        solution = solve(step.problem, solver, tol=TOL)
+        if best is None or solution.residual.relative < best.residual.relative:
+            best = solution
+        if best.residual.relative <= MAX_RESIDUAL:
+            break
+    assert best is not None
+    relative = best.residual.relative
+    is_solved = relative <= max(MAX_RESIDUAL, best.residual.roundoff_floor)
+    return Mixture(step.velocity_of(best.impulse), relative, is_solved)
+
+
+@dataclass(frozen=True, eq=False)
+class StepProblem:
+    """The constraint problem of a step, and the integrator that moves bodies by its impulses."""
+
+    problem: Problem | None  # None without rows.
+    jacobian: FloatArray  # (m, nv): rows of the problem.
+    matrix: FloatArray  # (nv, nv): M + H.
+    free: FloatArray  # (nv,) m/s, rad/s: velocity after the step without constraints.
+
+    def velocity_of(self, impulse: FloatArray) -> FloatArray:
+        """Return the velocity after the step (nv,) [m/s, rad/s] for impulses (m,) [N s] of the problem's rows."""
+        return self.free + np.linalg.solve(self.matrix, self.jacobian.T @ impulse)
+
+
+def assemble(
+    sources: Mapping[str, StepRecord], pairing: Pairing, velocity: FloatArray | None = None,
+    blocks: list[tuple[StepRecord, int]] | None = None,
+) -> StepProblem:  # fmt: skip
+    """Return the problem of a step; the parameters are those of `solve_mixture`.
+
+    `blocks` are the (record, index) of its blocks in their order; default: those of the sources.
+    """
     base = sources["rows"]
     before = base.velocity if velocity is None else velocity
     dt, mass = base.dt, sources["mass"].mass
@@ -105,12 +143,12 @@ def solve_mixture(
         after = after + sources["method"].velocity_change
     rows = [
         part
-        for record, i in _iterate_blocks(sources, pairing)
+        for record, i in (_iterate_blocks(sources, pairing) if blocks is None else blocks)
         for part in [_make_rows(record, i, sources, pairing, before, added, inverse)]
         if part is not None
     ]
     if not rows:
-        return Mixture(after, 0.0, True)
+        return StepProblem(None, np.zeros((0, len(before))), mass + added, after)
     jacobian = np.vstack([x.jacobian for x in rows])
     problem = Problem.from_jacobian(
         jacobian, metric, free, target=np.concatenate([x.target for x in rows]),
@@ -118,18 +156,7 @@ def solve_mixture(
         compliance=np.concatenate([x.compliance for x in rows]),
         friction=_choose_law(sources, rows),
     )  # fmt: skip
-    best = None
-    for solver in SOLVERS:
-        solution = solve(problem, solver, tol=TOL)
-        if best is None or solution.residual.relative < best.residual.relative:
-            best = solution
-        if best.residual.relative <= MAX_RESIDUAL:
-            break
-    assert best is not None
-    relative = best.residual.relative
-    push = jacobian.T @ best.impulse
-    after = after + np.linalg.solve(mass + added, push)
-    return Mixture(after, relative, relative <= max(MAX_RESIDUAL, best.residual.roundoff_floor))
+    return StepProblem(problem, jacobian, mass + added, after)
 
 
 def _choose_law(sources: Mapping[str, StepRecord], rows: list[_Rows]) -> str:

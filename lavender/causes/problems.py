@@ -1,8 +1,11 @@
-"""A `Problem` and an engine's impulses as a `StepRecord`, for problems of which no more is known.
+"""The constraint problem of a `StepRecord`, and a record of a `Problem` of which no more is known.
 
-The step has a length of 1 s and starts at v*. The velocity of a surface is the target of its rows without compliance;
-the target of softened friction rows is an engine's damping, so that their surface has the velocity 0 unless it is
-given.
+    step = problem_of_record(record)
+    step.velocity_of(lavender.solve(step.problem, "newton").impulse)    # moved by the engine's own integrator
+
+A record of a problem and an engine's impulses has a step of 1 s that starts at v*. The velocity of a surface is the
+target of its rows without compliance; the target of softened friction rows is an engine's damping, so that their
+surface has the velocity 0 unless it is given.
 """
 
 from __future__ import annotations
@@ -11,12 +14,32 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
+from lavender.causes.matching import Pairing
+from lavender.causes.mixture import PARTS, StepProblem, assemble
 from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT, CONTACT_BOX, CONTACT_ELLIPSE, ROUND
 
 ROUNDING = 8.0 * np.finfo(float).eps  # [-] A target of this part of its terms is rounding.
 MAX_ENTRIES = 4_000_000  # Larger dense matrices of a problem are not made.
+
+
+def problem_of_record(record: StepRecord) -> StepProblem:
+    """Return the constraint problem of a step, in the order of its blocks, with the engine's integrator.
+
+    Parameters
+    ----------
+    record : StepRecord
+
+    Returns
+    -------
+    StepProblem
+        `problem` with the references and compliances that the engine makes from its settings, or None without rows;
+        `velocity_of` returns the velocity after the step for any impulses of its rows.
+    """
+    blocks = [(record, i) for i in range(len(record.blocks))]
+    pairing = Pairing.of_records(record, record)
+    return assemble(dict.fromkeys(PARTS, record), pairing, blocks=blocks)
 
 
 def record_of_problem(

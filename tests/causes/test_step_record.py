@@ -10,6 +10,7 @@ import mujoco
 import planted_changes as planted
 
 import lavender as lv
+from lavender.causes.problems import problem_of_record
 
 
 def read(name="gripper", *changes, integrator="Euler", cone="pyramidal"):
@@ -404,3 +405,32 @@ def test_solver_that_stops_early_has_lost_no_digits(solver):
     <geom type="plane" size="3 3 .1"/>{boxes}</worldbody></mujoco>"""
     parts = lv.compare(read_text(text)).parts
     assert np.abs(parts["solver"].mean).max() > 1e-3 and not parts["lost digits"].mean.any()
+
+
+@pytest.mark.parametrize(
+    ("integrator", "cone"),
+    [
+        ("Euler", "pyramidal"),
+        ("implicitfast", "elliptic"),
+        ("discrete", "elliptic"),
+        ("discrete", "pyramidal"),
+    ],
+)
+@pytest.mark.parametrize("name", ["gripper", "sliding", "arm", "tendon", "ball"])
+def test_problem_of_a_record_is_the_problem_that_mujoco_solves(name, integrator, cone):
+    """Its matrix and right side are those of `from_mujoco`, and MuJoCo's own impulses move it to MuJoCo's velocity."""
+    model, data = planted.load(name, integrator, cone)
+    record = lv.io.step_from_mujoco(model, data)
+    mujoco.mj_forward(model, data)
+    own, impulse = lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data)
+    step = problem_of_record(record)
+    matrix, right = own.dense(), np.abs(own.b).max()
+    # Rates and compliances are computed from settings, and M + H from a measured inverse.
+    np.testing.assert_allclose(
+        step.problem.dense(), matrix, rtol=0, atol=1e-9 * np.abs(matrix).max()
+    )
+    np.testing.assert_allclose(step.problem.b, own.b, rtol=0, atol=1e-9 * max(1.0, right))
+    np.testing.assert_allclose(
+        step.velocity_of(impulse), record.velocity_after, rtol=0,
+        atol=1e-9 * max(1.0, np.abs(record.velocity_after).max()),
+    )  # fmt: skip
