@@ -36,6 +36,8 @@ START_TIME = 2.0  # [s] With less time left, no process is started within the li
 KILL_TIMEOUT = 10.0  # [s] The end of a killed process is awaited for this long.
 MAX_OVERRUN = 0.5  # [s] A process is killed this long after the limit of its call, as long as its start takes.
 WAITING_STEP = 2e-4  # [s] Interval in which a call looks for a process that has ended its call.
+# So many processes are kept: the call after one beyond its limit begins at once in another.
+KEPT_PROCESSES = 2
 MAX_OVERRUNNING = (
     2  # With as many processes beyond the limit of their calls, no other one is started.
 )
@@ -255,7 +257,7 @@ def _call_in_process(
 def start_process(backend: Backend) -> None:
     """Start a process that has imported the backend's code, before the clock of a time limit starts.
 
-    If processes go on beyond the limit of a call, another one is started in the background.
+    Others are started in the background: up to KEPT_PROCESSES, and one if all go on beyond the limit of a call.
     """
     with _LOCK:
         is_busy = [process.is_busy for process in idle_processes]
@@ -267,6 +269,8 @@ def start_process(backend: Backend) -> None:
         TimeoutError, BackendFailed, InputError
     ):  # The later call raises these errors.
         _call_in_process(backend, warm_up, backend, timeout=START_TIMEOUT)
+    if len(idle_processes) < KEPT_PROCESSES:
+        start_spare((backend,))
 
 
 def start_spare(backends: tuple[Backend, ...]) -> None:

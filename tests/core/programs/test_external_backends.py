@@ -244,11 +244,13 @@ def end_idle_processes():
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
-def test_isolated_process_is_reused_and_replaced_after_its_death():
+def test_isolated_process_is_reused_and_replaced_after_its_death(monkeypatch):
+    from lavender.programs import isolated
     from lavender.programs.isolated import idle_processes
 
     problem = lv.Problem.lcp(*spd(5))
     end_idle_processes()
+    monkeypatch.setattr(isolated, "KEPT_PROCESSES", 1)
     lv.solve(problem, APART[0], time_limit=600.0)
     (process,) = idle_processes
     before = process.popen
@@ -266,6 +268,7 @@ def test_isolated_process_goes_on_beyond_a_limit_and_serves_later_calls(monkeypa
 
     monkeypatch.setattr(isolated, "MAX_OVERRUN", 600.0)
     monkeypatch.setattr(isolated, "START_TIME", 600.0)
+    monkeypatch.setattr(isolated, "KEPT_PROCESSES", 1)
     end_idle_processes()
     large, small = lv.Problem.lcp(*spd(400, seed=3)), lv.Problem.lcp(*spd(5))
     lv.solve(small, APART[0], time_limit=300.0)
@@ -279,6 +282,26 @@ def test_isolated_process_goes_on_beyond_a_limit_and_serves_later_calls(monkeypa
         time.sleep(0.01)
     assert lv.solve(small, APART[0], time_limit=300.0).success
     assert isolated.idle_processes == [process] and process.popen is before
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_call_after_one_beyond_its_limit_begins_in_a_process_that_is_kept(monkeypatch):
+    from lavender.programs import isolated
+
+    monkeypatch.setattr(isolated, "MAX_OVERRUN", 600.0)
+    end_idle_processes()
+    small = lv.Problem.lcp(*spd(5))
+    lv.solve(small, APART[0], time_limit=300.0)
+    deadline = time.monotonic() + 60.0
+    while isolated.is_starting_spare() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    busy = isolated.idle_processes[0]
+    with pytest.raises(TimeoutError):
+        busy.call_function(time.sleep, 30.0, timeout=0.01)
+    kept = isolated.idle_processes[-1].popen
+    assert lv.solve(small, APART[0], time_limit=1.0).success  # Less than START_TIME.
+    assert busy.is_busy and kept in [process.popen for process in isolated.idle_processes]
+    end_idle_processes()
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
