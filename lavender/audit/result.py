@@ -32,8 +32,10 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
 from lavender.diagnostics.forces import CONTACT, ContactForces, contact_forces
+from lavender.io.mujoco import read_gaps
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.npz import write_npz
+from lavender.io.start_states import VECTOR
 from lavender.io.stored import prepare_step_folder, write_arrays, write_text
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.report.text import (
@@ -423,7 +425,8 @@ class Audit:
         folder = self.folder = Path(folder)
         worst = prepare_step_folder(folder / "worst", replace=True)
         for i, w in enumerate(self.worst, 1):
-            write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
+            gap = self._read_gaps(w)
+            write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse, gap=gap)
         self.save_states("worst", folder / "states.npz")
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
@@ -437,6 +440,16 @@ class Audit:
             records["against"] = self.against.numbers[0]
         write_arrays(folder / "records.npz", records)
         write_text(folder / "forces.csv", self.forces.to_csv(index=False))
+
+    def _read_gaps(self, worst: Worst) -> FloatArray | None:
+        """Return the gaps of a worst step of MuJoCo itself [m]; None for other engines."""
+        if self.engine != "mujoco" or self.runs.model is None or VECTOR not in worst.state:
+            return None
+        mj, model = self.runs.mj, self.runs.model
+        data = mj.MjData(model)
+        mj.mj_setState(model, data, worst.state[VECTOR], mj.mjtState.mjSTATE_INTEGRATION)
+        mj.mj_forward(model, data)
+        return read_gaps(data, worst.problem)
 
     @cached_property
     def _forces_of_worst(self) -> list[tuple[int, Worst, ContactForces]]:

@@ -20,7 +20,7 @@ from lavender.cli.options import (
 from lavender.io.stored import check_writable, format_json, write_text
 
 # Columns that a narrow terminal leaves out, in this order.
-NARROW_JUDGE_OMITS = ("unique", "bodies")
+NARROW_JUDGE_OMITS = ("unique", "gap [mm]", "bodies")
 
 
 @click.command()
@@ -46,15 +46,16 @@ def judge(
 ) -> None:
     """Judge the answer that is stored in a file, row by row.
 
-    FILE is a problem with an impulse: of `lav_dump_answer` of the C library, of `lavender.io.save(problem, path,
-    impulse=...)`, or a step of a recording or an audit. The table has the rows with the largest errors: the stored
-    impulse, an exact impulse (of `auto`, to a relative residual of 1e-10), whether all solutions share it, the error in
-    m/s or rad/s, and the state of the row.
+    FILE is a problem with an impulse: of `lav_dump_named` or `lav_dump_answer` of the C library, of
+    `lavender.io.save(problem, path, impulse=..., gap=...)`, or a step of a recording or an audit. The table has the
+    rows with the largest errors: their bodies, the gap if the file has it, the stored impulse, an exact impulse (of
+    `auto`, to a relative residual of 1e-10), whether all solutions share it, the error in m/s or rad/s, and the state
+    of the row.
 
     Exit code 0: the answer is at its floor or close enough (--threshold). 1: its solver stopped early, or it is wrong.
     Exit code 2: the file has no answer, or is a quadratic program.
     """
-    from lavender import report
+    from lavender import io, report
     from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.report.render import print_table
@@ -78,7 +79,8 @@ def judge(
         )
     solution = solve(problem, impulse=impulse, tol=1e-10)
     is_solved = solution.residual.relative <= 1e-8 or solution.residual.at_floor
-    table = tabulate_rows(problem, impulse, judged, solution if is_solved else None)
+    gap = io.read(item.source).gap if item.source.endswith(".npz") else None
+    table = tabulate_rows(problem, impulse, judged, solution if is_solved else None, gap)
     if output is not None:
         write_text(output, table.to_csv(index=False))
     if as_json:

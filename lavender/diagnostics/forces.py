@@ -274,21 +274,20 @@ def _list_contacts(problem: Problem) -> list[_Contact]:
             if not edge:
                 continue
             if name not in pyramids or number == "0":
-                pyramids[name] = _Contact(name, _name_pair(name), [], [])
+                pyramids[name] = _Contact(name, name_pair(name) or name, [], [])
                 contacts.append(pyramids[name])
             pyramids[name].normals.extend(range(first, int(cones.ptr[k + 1])))
             continue
-        pair = _name_pair(name)
-        if rows is not None:
-            pair = " and ".join("ground" if b < 0 else f"body {b}" for b in next(bodies))
+        own = " and ".join("ground" if b < 0 else f"body {b}" for b in next(bodies, ()))
+        pair = name_pair(name) or own or name
         count = min(2, int(cones.n_tangents[k]))
         contacts.append(_Contact(name, pair, [first], list(range(first + 1, first + 1 + count))))
     return contacts
 
 
-def _name_pair(contact: str) -> str:
-    """Return the names in parentheses of a contact's name, or the name itself."""
-    return contact.partition(" (")[2].rstrip(")").replace(", ", " and ") or contact
+def name_pair(block: str) -> str:
+    """Return the two names in parentheses of a block's name, as "a and b"; empty without them."""
+    return block.partition(" (")[2].partition(")")[0].replace(", ", " and ")
 
 
 def _find_determined(

@@ -133,6 +133,7 @@ def save(
     path: str | os.PathLike[str],
     *,
     impulse: Any = None,
+    gap: Any = None,
     drop: Collection[str] = (),
 ) -> None:
     """Write a problem; the suffix selects the format. An existing file is replaced atomically.
@@ -144,6 +145,8 @@ def save(
         `.npz` (our own format), or `.hdf5`, `.h5` (FCLIB's local form, for which A is formed).
     impulse : (m,) N s, optional
         Stored with the problem as its solution.
+    gap : (k,) m, optional
+        `.npz` only: distance of the surfaces of each contact, nan of other blocks, for `lavender judge`.
     drop : names, optional
         FCLIB only: parts of the problem to leave out, of "names" (of blocks and velocities), "key" and "precision"
         (float32). FCLIB cannot hold them: a problem that has one of them is rejected unless `drop` names it.
@@ -163,8 +166,10 @@ def save(
             raise InputError(
                 "drop= has no effect on an .npz file, which holds everything: leave it out"
             )
-        write_npz(problem, path, impulse=impulse)
+        write_npz(problem, path, impulse=impulse, gap=gap)
     elif suffix in HDF5:
+        if gap is not None:
+            raise InputError(f"gap is given and {path} is FCLIB's; .npz is needed for it")
         fclib.write(problem, path, impulse=impulse, drop=drop)
     else:
         raise InputError(

@@ -26,6 +26,7 @@ the error of `impulse`.
 
 from __future__ import annotations
 
+import re
 import weakref
 from dataclasses import replace
 from functools import partial
@@ -58,6 +59,9 @@ SUM_TOLERANCE = 2.0**-40
 # [-] Largest difference of a velocity after a step from the predicted one, relative to the largest velocity and to
 # 1 m/s: the rounding of a solve with a mass matrix of a condition of up to 1e6.
 PREDICTION_TOLERANCE = 1e-9
+CONTACT_NUMBER = re.compile(
+    r"contact (\d+) "
+)  # Of a block's name: the number of the contact in MjData.
 # The velocity before the step is recovered from the velocities of bodies only if each joint's axis has at least this
 # fraction that is independent of the joints before it in the same body [-].
 MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
@@ -339,6 +343,13 @@ def get_block_keys(blocks: Any) -> np.ndarray:
 
 
 @np.errstate(over="ignore", invalid="ignore")
+def read_gaps(data: Any, problem: Problem) -> FloatArray:
+    """Return the distance [m] of the surfaces of each contact of a problem of `data` (k,), nan of other blocks."""
+    numbers = [CONTACT_NUMBER.match(problem.block_name(k)) for k in range(problem.n_blocks)]
+    dist = np.array(data.contact.dist)
+    return np.array([np.nan if number is None else dist[int(number[1])] for number in numbers])
+
+
 def impulse(model: Any, data: Any) -> FloatArray:
     """Return MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force divided by `scaling`.
 

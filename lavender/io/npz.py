@@ -44,7 +44,7 @@ def _list_matrix_entries(name: str, *more: str) -> set[str]:
 
 PROGRAM_ENTRIES = {*PROGRAM}.union(*(_list_matrix_entries(name, "shape") for name in "PGA"))
 #: Entries of every operator, and those of each.
-ENTRIES = {"lavender_format", "meta", "guess", "key", "angular", "impulse"}
+ENTRIES = {"lavender_format", "meta", "guess", "key", "angular", "impulse", "gap"}
 CONSTRAINTS = {"b", *CONES, "cones_rolling"}
 ENTRIES_OF: dict[str, set[str]] = {
     "dense": {"A", *CONSTRAINTS},
@@ -73,6 +73,8 @@ class Stored:
     compare : str
         Unique quantities of the solution, if the file names them: "l,w", "r,u", "w", "u", "error", "no solution".
     guesses : tuple of (m,) N s
+    gap : (k,) m, optional
+        Distance of the surfaces of each contact, negative in penetration; nan of other blocks.
     info : mapping of str to str
         Texts of the file: title, description, ...
     """
@@ -83,6 +85,7 @@ class Stored:
     slack: FloatArray | None = None
     compare: str = ""
     guesses: tuple[FloatArray, ...] = ()
+    gap: FloatArray | None = None
     info: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -116,8 +119,10 @@ def read_npz(path: str | os.PathLike[str]) -> Stored:
 # -- our own format -------------------------------------------------------------------------------
 
 
-def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None) -> None:
-    """Write a problem in our own format, optionally with an impulse (m,) [N s], for example its solution.
+def write_npz(
+    problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None, gap: Any = None
+) -> None:
+    """Write a problem in our own format, optionally with an impulse (m,) [N s] and the gaps (k,) [m] of its blocks.
 
     `read_npz(path).problem == problem`, bit for bit. If the impulse is an engine's answer, the motion of the engine is
     written, too, so that `residual` judges what moved the bodies.
@@ -153,6 +158,7 @@ def write_npz(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = 
         "key": problem.key,
         "angular": None if problem.angular is None else problem.angular.astype(np.int8),
         "impulse": None if impulse is None else problem.make_start(impulse),
+        "gap": None if gap is None else _check_gap("gap", gap, problem),
     }
     arrays |= {name: x for name, x in stored.items() if x is not None}
     names = None if problem.names is None else list(problem.names)
@@ -249,7 +255,12 @@ def _read_own_format(archive: Arrays) -> Stored:
         problem.__dict__["engine_motion"] = EngineMotion(
             moved, change, compliance, moved_by, *momentum
         )
-    return Stored(problem, "lavender", impulse=impulse)
+    gap = _check_gap("entry 'gap'", archive["gap"], problem) if "gap" in archive else None
+    return Stored(problem, "lavender", impulse=impulse, gap=gap)
+
+
+def _check_gap(name: str, gap: Any, problem: Problem) -> FloatArray:
+    return as_array(name, gap, (problem.n_blocks,), finite=False, unit="m")
 
 
 def _check_known(kind: str, given: Iterable[str], known: set[str]) -> None:

@@ -257,13 +257,14 @@ class Recorder:
         problem: Problem,
         impulse: Any,
         state: Mapping[str, Any] | None = None,
+        gap: Any = None,
     ) -> None:
         """Write the files of a step, and add its line; Ctrl-C leaves no file without a line."""
         path = self.folder / line["file"]
         if state is not None:
             write_arrays(make_folder(self.folder / STATES_FOLDER) / path.name, state)
         try:
-            write_npz(problem, path, impulse=impulse)
+            write_npz(problem, path, impulse=impulse, gap=gap)
             self.lines[path.name] = line
         finally:
             if path.name not in self.lines:

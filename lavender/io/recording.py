@@ -166,7 +166,8 @@ def record(
                     without += 1
                     continue
                 problem, impulse, facts = result
-                recorder.write_step(line | facts, problem, impulse)
+                gap = adapter.read_gaps(data, problem)
+                recorder.write_step(line | facts, problem, impulse, gap=gap)
         except KeyboardInterrupt:
             if not recorder.files:
                 raise

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from lavender.base.arrays import FloatArray
+from lavender.diagnostics.forces import name_pair
 from lavender.diagnostics.redundancy import redundancy
 from lavender.judge.residuals import Residual
 from lavender.judge.solution import Solution
@@ -16,7 +18,11 @@ from lavender.report.text import format_speed
 
 
 def tabulate_rows(
-    problem: Problem, impulse: Any, judged: Residual, exact: Solution | None
+    problem: Problem,
+    impulse: Any,
+    judged: Residual,
+    exact: Solution | None,
+    gap: FloatArray | None = None,
 ) -> pd.DataFrame:
     """Return a DataFrame with a row for each row of a problem, the largest errors first.
 
@@ -29,12 +35,15 @@ def tabulate_rows(
         Its residual.
     exact : Solution or None
         A solution, or None if none was found.
+    gap : (k,) m, optional
+        Distance of the surfaces of each contact.
 
     Returns
     -------
     DataFrame
-        `row`, `bodies`, `impulse [N s]` and `exact [N s]` (N m s on angular rows), `unique` (whether all solutions have
-        the same impulse), `error` (text in m/s or rad/s), `error [m/s, rad/s]` and `state`.
+        `row`, `bodies`, `gap [mm]` of contacts if it is given, `impulse [N s]` and `exact [N s]` (N m s on angular
+        rows), `unique` (whether all solutions have the same impulse), `error` (text in m/s or rad/s), `error [m/s,
+        rad/s]` and `state`.
     """
     states = compute_states(problem, impulse)
     names = [name for state in states for name in state.rows]
@@ -52,12 +61,21 @@ def tabulate_rows(
             "state": names,
         }
     )
+    if gap is not None:
+        of_rows = np.full(problem.m, np.nan)
+        of_rows[problem.cones.ptr[:-1]] = 1e3 * gap
+        table.insert(2, "gap [mm]", of_rows)
     return table.sort_values("error [m/s, rad/s]", ascending=False, kind="stable")
 
 
 def _name_bodies(problem: Problem) -> list[str]:
-    """Return the bodies of each row; empty texts if the problem does not have bodies."""
+    """Return the bodies of each row: those in parentheses after its name, else numbers; else empty texts."""
     rows = problem.rows
+    if problem.names:
+        sizes = np.diff(problem.cones.ptr).tolist()
+        found = [name_pair(problem.block_name(k)) for k in range(problem.n_blocks)]
+        if rows is None or all(found):
+            return [text for text, n in zip(found, sizes, strict=True) for _ in range(n)]
     if rows is None:
         return [""] * problem.m
     pairs = [*rows.joint_body.tolist(), *rows.contact_body.tolist()]

@@ -1,6 +1,7 @@
 """`lavender judge`: one stored answer, row by row."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -51,3 +52,44 @@ def test_judge_without_an_answer_names_what_is_needed(lavender, problem, tmp_pat
     lv.io.save(problem, tmp_path / "none.npz")
     code, _, err = lavender("judge", tmp_path / "none.npz")
     assert code == cli.EXIT_BAD_INPUT and "entry 'impulse'" in err and "lavender check" in err
+
+
+def test_judge_shows_bodies_and_gaps(lavender, problem, tmp_path):
+    names = [f"contact {k} (crate {k}, shelf)" for k in range(problem.n_blocks)]
+    named = replace(problem, names=tuple(names))
+    gap = np.linspace(-2e-3, 1e-3, problem.n_blocks)
+    early = lv.solve(named, "pgs", max_iter=5).impulse
+    lv.io.save(named, tmp_path / "named.npz", impulse=early, gap=gap)
+    assert lv.io.read(tmp_path / "named.npz").gap.tolist() == gap.tolist()
+    _, out, _ = lavender("judge", tmp_path / "named.npz", "--csv", tmp_path / "rows.csv")
+    table = pd.read_csv(tmp_path / "rows.csv").set_index("row")
+    for k, name in enumerate(names):
+        assert table.loc[f"{name}, normal", "gap [mm]"] == pytest.approx(1e3 * gap[k])
+        assert table.loc[f"{name}, normal", "bodies"] == f"crate {k} and shelf"
+        assert np.isnan(table.loc[f"{name}, tangent 1", "gap [mm]"])
+    assert "gap" in out
+    with pytest.raises(lv.InputError, match=r"gap \[m\] has shape"):
+        lv.io.save(named, tmp_path / "bad.npz", gap=gap[1:])
+    with pytest.raises(lv.InputError, match=r"npz is needed"):
+        lv.io.save(named, tmp_path / "bad.h5", gap=gap)
+
+
+def test_judge_of_recorded_steps_of_mujoco_has_the_distances_of_its_contacts(lavender, tmp_path):
+    mujoco = pytest.importorskip(
+        "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+    )
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><geom type="plane" size="0 0 1"/>
+      <body pos="0 0 .0995"><freejoint/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody></mujoco>""")
+    lv.io.record(model, mujoco.MjData(model), tmp_path / "steps", 3)
+    data = mujoco.MjData(model)
+    for step in range(1, 4):
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        stored = lv.io.read(tmp_path / "steps" / f"step_{step}.npz")
+        wanted = np.repeat(data.contact.dist, 4)  # Edges of pyramids.
+        np.testing.assert_allclose(stored.gap, wanted, rtol=1e-12)
+    path = tmp_path / "steps" / "step_3.npz"
+    assert lavender("judge", path, "--csv", tmp_path / "rows.csv")[0] == 0
+    table = pd.read_csv(tmp_path / "rows.csv")
+    assert table["gap [mm]"].min() == pytest.approx(1e3 * wanted.min(), rel=1e-9)
+    assert set(table["bodies"]) == {"0 and box"}

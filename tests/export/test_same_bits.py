@@ -4,8 +4,11 @@ import ctypes as ct
 import dataclasses
 import itertools
 import re
+import subprocess
+import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import random_problems as rp
 from clib import METHODS, Motion, Refused, run
@@ -492,25 +495,56 @@ def test_c_frames_in_float32_are_corrected_like_the_package(library):
 
 DUMP = """#include "lavender_dump.h"
 LAV_API int32_t dump(lav_solver *s, const lav_problem *q, const char *path) { return lav_dump(s, q, path); }
+LAV_API int32_t dump_named(lav_solver *s, const lav_problem *q, const char *folder, const double *x,
+                           const lav_names *names) {
+  return lav_dump_named(s, q, folder, "named", x, 0.0, "mine", names);
+}
+LAV_API int32_t load(const char *path) {
+  lav_loaded x;
+  const int32_t code = lav_load(path, &x);
+  lav_unload(&x);
+  return code;
+}
+/* Read a file, run a solver on it, and write what was read with the impulses. */
+LAV_API int32_t reload(const char *path, const lav_options *options, const char *again) {
+  lav_loaded x;
+  lav_solver *s;
+  lav_budget budget;
+  lav_result result;
+  uint64_t bytes;
+  double *impulse;
+  void *memory = NULL;
+  int32_t code = lav_load(path, &x);
+  if (code != LAV_OK) return code;
+  impulse = (double *)calloc((size_t)x.problem.n_rows + 1, 8);
+  result.size = (uint32_t)sizeof result;
+  lav_default_budget(&budget), budget.iterations = 7, budget.tol = 0.0;
+  if ((code = lav_workspace_size(&x.problem, options, &bytes)) == LAV_OK) memory = malloc((size_t)bytes + (1 << 20));
+  if (code == LAV_OK) code = lav_open(memory, bytes + (1 << 20), &x.problem, options, &s);
+  if (code == LAV_OK) code = lav_set(s, &x.problem);
+  if (code == LAV_OK) code = lav_run(s, &budget, &result);
+  if (code == LAV_OK) code = lav_impulse(s, impulse, x.problem.n_rows);
+  if (code == LAV_OK) code = lav_dump_with(s, &x.problem, again, impulse, NULL);
+  lav_unload(&x), free(memory), free(impulse);
+  return code;
+}
 """
 
 
-def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
-    (tmp_path / "dump.c").write_text(DUMP)
-    flags = [
-        "-Wall",
-        "-Wextra",
-        "-Wpedantic",
-        "-Werror",
-        "-DLAV_SHARED",
-        "-fPIC",
-        "-shared",
-        "-I",
-        folder,
-    ]
-    run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")
-    run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", tmp_path / "dump.c")
-    c = ct.CDLL(str(tmp_path / "dump.so"))
+@pytest.fixture(scope="module")
+def dumper(library, folder, compiler, tmp_path_factory):
+    """The functions of DUMP, compiled as C99 without a warning and accepted as C++11."""
+    out = tmp_path_factory.mktemp("dump")
+    (out / "dump.c").write_text(DUMP)
+    flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED"]
+    flags += ["-fPIC", "-shared", "-I", folder]
+    run(compiler, "-std=c99", *flags, out / "dump.c", library.path, "-o", out / "dump.so")
+    run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", out / "dump.c")
+    return ct.CDLL(str(out / "dump.so"))
+
+
+def test_c_library_dump_is_the_problem_to_the_last_bit(library, dumper, tmp_path):
+    c = dumper
     path = tmp_path / "step.npz"
     looked = set()
     for given in GIVEN:
@@ -544,3 +578,94 @@ def test_c_library_dump_is_the_problem_to_the_last_bit(library, folder, compiler
     missing = str(tmp_path / "no" / "such").encode()
     assert c.dump(solver.at, ct.byref(problem), missing) == -20
     assert c.dump(solver.at, None, missing) == c.dump(solver.at, ct.byref(problem), None) == -1
+
+
+def test_c_library_reads_its_files_to_the_last_bit(library, dumper, tmp_path):
+    path, again = tmp_path / "step.npz", tmp_path / "again.npz"
+    for given in GIVEN:
+        key = np.arange(given.n_blocks, dtype=np.uint64) + np.uint64(2**63)
+        problem = library.problem(given, key=key)
+        options = library.options("block_gauss_seidel")
+        solver = library.open(problem, options)
+        assert dumper.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
+        for stored in (path, tmp_path / "plain.npz"):  # NumPy's own uncompressed archive, too.
+            np.savez(tmp_path / "plain.npz", **dict(np.load(path)))
+            code = dumper.reload(str(stored).encode(), ct.byref(options), str(again).encode())
+            assert code == 0
+            found = lv.io.read(again)
+            assert found.problem == lv.load(path)
+            assert np.array_equal(found.problem.key, key)
+            solver.run(7, 0.0)
+            assert found.impulse.tobytes() == solver.impulse().tobytes()
+            solver = library.open(problem, options)
+
+
+def test_c_library_reads_no_damaged_file(library, dumper, tmp_path):
+    given = lv.suite.box_stack(2).problem
+    problem = library.problem(given)
+    solver = library.open(problem, library.options("block_gauss_seidel"))
+    path, bad = tmp_path / "step.npz", tmp_path / "bad.npz"
+    assert dumper.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
+    assert dumper.load(str(path).encode()) == 0
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for end in (0, 1, 21, 22, *rng.integers(23, len(whole), 40).tolist()):
+        bad.write_bytes(whole[:end])
+        assert dumper.load(str(bad).encode()) == -20
+    for _ in range(300):  # An answer, and no crash; a changed number may still be a problem.
+        changed = bytearray(whole)
+        for at in rng.integers(0, len(whole), rng.integers(1, 9)):
+            changed[at] = rng.integers(256)
+        bad.write_bytes(changed)
+        assert dumper.load(str(bad).encode()) in (0, -11, -20)
+    lv.io.save(given, bad)
+    assert dumper.load(str(bad).encode()) == -20  # Compressed.
+    assert dumper.load(str(tmp_path / "none.npz").encode()) == -20
+    assert dumper.load(None) == -1
+
+
+class Names(ct.Structure):
+    _fields_ = [(name, ct.c_void_p) for name in ("block", "body", "gap")]
+
+
+@pytest.mark.parametrize("with_blocks", [False, True])
+def test_c_library_names_bodies_rows_and_gaps_for_judge(library, dumper, tmp_path, with_blocks):
+    given = rp.random_contact_problem(3)
+    problem, rows = library.problem(given), given.rows
+    solver = library.open(problem, library.options("block_gauss_seidel"))
+    solver.run(3, 0.0)
+    impulse = np.ascontiguousarray(solver.impulse())
+    bodies = [f'no. {i} "\\ü\t' for i in range(given.rows.inv_mass.size)]
+    blocks = [f"b{i}" if i % 2 else None for i in range(given.n_blocks)]
+    gap = np.linspace(-1e-3, 1e-3, given.n_blocks)
+    gap[: rows.n_joints] = np.nan
+    texts = [[None if x is None else x.encode() for x in names] for names in (blocks, bodies)]
+    arrays = [(ct.c_char_p * len(x))(*x) for x in texts]
+    at = [ct.cast(x, ct.c_void_p) for x in arrays]
+    names = Names(at[0] if with_blocks else None, at[1], gap.ctypes.data)
+    code = dumper.dump_named(
+        solver.at, ct.byref(problem), str(tmp_path).encode(),
+        impulse.ctypes.data_as(ct.c_void_p), ct.byref(names),
+    )  # fmt: skip
+    assert code == 0
+    stored = lv.io.read(tmp_path / "named.npz")
+    np.testing.assert_array_equal(stored.gap, gap)
+    np.testing.assert_array_equal(stored.impulse, impulse)
+    pairs = np.vstack([rows.joint_body, rows.contact_body]).tolist()
+    number = 0
+    for k, (name, pair) in enumerate(zip(stored.problem.names, pairs, strict=True)):
+        word = f"contact {number}" if given.cones.is_contact[k] else f"row {given.cones.ptr[k]}"
+        number += bool(given.cones.is_contact[k])
+        own = blocks[k] if with_blocks and blocks[k] else word
+        sides = ", ".join("world" if b < 0 else bodies[b] for b in pair)
+        assert name == f"{own} ({sides})"
+    words = ["lavender", "judge", tmp_path / "named.npz", "--csv", tmp_path / "rows.csv"]
+    done = subprocess.run([sys.executable, "-m", *words], capture_output=True, text=True)
+    table = pd.read_csv(tmp_path / "rows.csv")
+    assert done.stderr == "" and len(table) == given.m
+    for text, number in zip(table["row"], table["gap [mm]"], strict=True):
+        if not text.endswith("normal"):
+            assert np.isnan(number)
+    known = sorted(table["gap [mm]"].dropna())
+    np.testing.assert_allclose(known, 1e3 * gap[rows.n_joints :], rtol=1e-12)
+    assert any("no. 0" in text for text in table["bodies"]) and " and " in table["bodies"][0]

@@ -1,5 +1,6 @@
 /* A problem as a file of the Python package: `lavender report steps/` reads a folder of them, in the order of their names.
- * With the impulses that the engine itself computed, `lav_dump_answer` also writes the line of the engine's result.
+ * With the impulses that the engine itself computed, `lav_dump_answer` also writes the line of the engine's result, and
+ * `lav_dump_named` names of bodies and rows, too. `lav_load` reads a file again.
  *
  * An .npz archive, uncompressed: arrays as they are, to the last bit. Needs <stdio.h> and malloc, which lavender.c does not.
  */
@@ -15,11 +16,21 @@
 
 enum { LAV_DUMP_ENTRIES = 32, LAV_DUMP_HEAD = 128 };
 
+/* What tables call the blocks (k) and bodies (n_bodies): "crate and ramp" of contact 3 becomes "contact 3 (crate, ramp)" if it
+ * has no name of its own. gap (k) m: distance of a contact's surfaces, NAN of other blocks. Arrays and names may be null. */
+typedef struct lav_names {
+  const char *const *block;
+  const char *const *body;
+  const double *gap;
+} lav_names;
+
 typedef struct lav_dump_file {
   FILE *file;
   int32_t count, is_bad;
   uint32_t table[256], crc[LAV_DUMP_ENTRIES], size[LAV_DUMP_ENTRIES], at[LAV_DUMP_ENTRIES];
   const char *name[LAV_DUMP_ENTRIES];
+  char *text; /* of the entry meta */
+  size_t length, room;
 } lav_dump_file;
 
 static inline uint32_t lav_dump_crc(const lav_dump_file *d, uint32_t crc, const void *data, size_t bytes) {
@@ -115,9 +126,47 @@ static inline void lav_dump_rows(lav_dump_file *d, const char *const *name, cons
   free(dense), free(to), free(start);
 }
 
+/* Append text to the entry meta; a name becomes a part of a JSON string. */
+static inline void lav_dump_text(lav_dump_file *d, const char *text, int32_t is_name) {
+  char own[8];
+  for (; *text && !d->is_bad; text++) {
+    const int32_t is_odd = is_name && (*text == '"' || *text == '\\' || (unsigned char)*text < 32);
+    const size_t n = (size_t)snprintf(own, sizeof own, is_odd ? "\\u%04x" : "%c", is_odd ? (int)(unsigned char)*text : (int)*text);
+    if (d->length + n > d->room) {
+      char *more = (char *)realloc(d->text, 2 * (d->room + 64));
+      if (!more) d->is_bad = 1;
+      else d->text = more, d->room = 2 * (d->room + 64);
+    }
+    if (!d->is_bad) memcpy(d->text + d->length, own, n), d->length += n;
+  }
+}
+
+/* The names of all blocks as a list of JSON: each one's own, or its number; then its bodies in parentheses. */
+static inline void lav_dump_names(lav_dump_file *d, const lav_problem *q, const lav_names *names, const int32_t *kind) {
+  char own[32];
+  int32_t i, side, contacts = 0;
+  for (i = 0; i < q->n_blocks; i++) {
+    const int32_t is_contact = kind[i] != LAV_ROW && kind[i] != LAV_ROUND, has_pair = names->body && q->form == LAV_BODIES;
+    const int32_t *pair = !has_pair ? NULL : i < q->n_joints ? q->joint_body + 2 * i : q->contact_body + 2 * (i - q->n_joints);
+    snprintf(own, sizeof own, is_contact ? "contact %d" : "row %d", (int)(is_contact ? contacts : q->block_ptr ? q->block_ptr[i] : i));
+    lav_dump_text(d, i ? ", \"" : "[\"", 0);
+    lav_dump_text(d, names->block && names->block[i] ? names->block[i] : own, 1);
+    for (side = 0; side < 2 && has_pair; side++) {
+      const int32_t body = pair[side];
+      snprintf(own, sizeof own, "body %d", (int)body);
+      lav_dump_text(d, side ? ", " : " (", 0);
+      lav_dump_text(d, body < 0 ? "world" : names->body[body] ? names->body[body] : own, 1);
+    }
+    lav_dump_text(d, has_pair ? ")\"" : "\"", 0);
+    contacts += is_contact;
+  }
+  lav_dump_text(d, q->n_blocks ? "]" : "[]", 0);
+}
+
 /* Write the problem that was set in a solver, with the right-hand side and the velocities v* that it has there, and an
- * impulse (m) [N s] unless it is null. */
-static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, const char *path, const double *impulse) {
+ * impulse (m) [N s] and names unless they are null: for `lavender judge FILE`. */
+static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, const char *path, const double *impulse,
+                                    const lav_names *names) {
   if (!solver || !q || !path) return LAV_ERROR_NULL;
   static const char *const jac[] = {"general_jac_data", "general_jac_indices", "general_jac_indptr"};
   static const char *const mass[] = {"general_mass_data", "general_mass_indices", "general_mass_indptr"};
@@ -129,7 +178,7 @@ static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, co
   double *b = (double *)calloc(2 * (size_t)m + (size_t)n_v + 1, 8), *v_free = b ? b + 2 * (size_t)m : NULL;
   int32_t *whole = (int32_t *)calloc(2 * (size_t)k + 2, 4), *kind = whole + k + 1, i, j, code;
   uint32_t end[8] = {0x06054b50, 0, 0, 0, 0, 0, 0, 0};
-  char meta[128], size[16];
+  char size[16];
   lav_dump_file d;
   lav_verdict verdict;
   verdict.size = (uint32_t)sizeof verdict;
@@ -159,6 +208,7 @@ static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, co
   if (q->impulse) lav_dump_reals(&d, "guess", q->impulse, m, "", 1, 0.0);
   snprintf(size, sizeof size, "%d,", (int)k);
   if (impulse) lav_dump_reals(&d, "impulse", impulse, m, "", 1, 0.0);
+  if (names && names->gap) lav_dump_reals(&d, "gap", names->gap, k, "", 1, 0.0);
   if (q->key) lav_dump_array(&d, "key", "u8", size, q->key, 8 * (size_t)k);
   if (is_bodies || general) lav_dump_reals(&d, "compliance", q->compliance, m, "", 1, 0.0);
   if (is_bodies) {
@@ -181,30 +231,34 @@ static inline int32_t lav_dump_with(lav_solver *solver, const lav_problem *q, co
     lav_dump_rows(&d, matrix, q->index_ptr, q->index, q->value, m, m, 0);
     lav_dump_array(&d, "A_shape", "i8", "2,", shape, 16);
   }
-  snprintf(meta, sizeof meta, "{\"operator\": \"%s\", \"friction\": \"%s\", \"name\": \"\", \"names\": null%s}",
-           is_bodies ? "rows" : general ? "generalized" : "csr", q->law == LAV_CONE ? "cone" : "coulomb",
-           general ? ", \"dof_names\": null" : "");
-  snprintf(size, sizeof size, "%d,", (int)strlen(meta));
-  lav_dump_array(&d, "meta", "u1", size, meta, strlen(meta));
+  lav_dump_text(&d, is_bodies ? "{\"operator\": \"rows\"" : general ? "{\"operator\": \"generalized\"" : "{\"operator\": \"csr\"", 0);
+  lav_dump_text(&d, q->law == LAV_CONE ? ", \"friction\": \"cone\"" : ", \"friction\": \"coulomb\"", 0);
+  lav_dump_text(&d, ", \"name\": \"\", \"names\": ", 0);
+  if (names && (names->block || names->body)) lav_dump_names(&d, q, names, kind);
+  else lav_dump_text(&d, "null", 0);
+  lav_dump_text(&d, general ? ", \"dof_names\": null}" : "}", 0);
+  snprintf(size, sizeof size, "%d,", (int)d.length);
+  lav_dump_array(&d, "meta", "u1", size, d.text, d.length);
   end[3] = end[4] = (uint32_t)d.count, end[6] = (uint32_t)ftell(d.file);
   for (i = 0; i < d.count; i++) lav_dump_head(&d, i, 1);
   end[5] = (uint32_t)ftell(d.file) - end[6];
   lav_dump_numbers(&d, "42222442", end);
-  free(b), free(whole);
+  free(b), free(whole), free(d.text);
   return fclose(d.file) != 0 || d.is_bad ? LAV_ERROR_FILE : LAV_OK;
 }
 
 /* Write the problem that was set in a solver. The arrays of q are as in the last lav_set, except for `velocity`, which is
  * not read: it may hold the velocities after the solve. */
 static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const char *path) {
-  return lav_dump_with(solver, q, path, NULL);
+  return lav_dump_with(solver, q, path, NULL, NULL);
 }
 
-/* Write FOLDER/NAME.npz with the impulses (m) [N s] that the engine's own solver computed, and append the line of this
- * result to FOLDER/engine.jsonl: its time [s] and the name of the solver, in letters, digits, spaces and -_.()+ (others
- * become _). `lavender report FOLDER` judges these impulses and shows them among the solvers. */
-static inline int32_t lav_dump_answer(lav_solver *solver, const lav_problem *q, const char *folder, const char *name,
-                                      const double *impulse, double seconds, const char *method) {
+/* Write FOLDER/NAME.npz with the impulses (m) [N s] that the engine's own solver computed and with names, which may be null,
+ * and append the line of this result to FOLDER/engine.jsonl: its time [s] and the name of the solver, in letters, digits,
+ * spaces and -_.()+ (others become _). `lavender report FOLDER` judges these impulses and shows them among the solvers;
+ * `lavender judge FOLDER/NAME.npz` shows them row by row. */
+static inline int32_t lav_dump_named(lav_solver *solver, const lav_problem *q, const char *folder, const char *name,
+                                     const double *impulse, double seconds, const char *method, const lav_names *names) {
   const char *const texts[] = {folder, name, method};
   char path[2100], plain[3][1024];
   FILE *lines;
@@ -219,13 +273,228 @@ static inline int32_t lav_dump_answer(lav_solver *solver, const lav_problem *q, 
     for (j = 0; plain[i][j]; j++)
       if (!strchr("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 -_.()+", plain[i][j])) plain[i][j] = '_';
   snprintf(path, sizeof path, "%s/%s.npz", plain[0], plain[1]);
-  code = lav_dump_with(solver, q, path, impulse);
+  code = lav_dump_with(solver, q, path, impulse, names);
   if (code != LAV_OK) return code;
   snprintf(path, sizeof path, "%s/engine.jsonl", plain[0]);
   if (!(lines = fopen(path, "ab"))) return LAV_ERROR_FILE;
   is_bad = fprintf(lines, "{\"file\": \"%s.npz\", \"rows\": %d, \"seconds\": %.9g, \"solver\": \"%s\"}\n", plain[1],
                    (int)q->n_rows, seconds, plain[2]) < 0;
   return fclose(lines) != 0 || is_bad ? LAV_ERROR_FILE : LAV_OK;
+}
+
+/* As lav_dump_named, without names. */
+static inline int32_t lav_dump_answer(lav_solver *solver, const lav_problem *q, const char *folder, const char *name,
+                                      const double *impulse, double seconds, const char *method) {
+  return lav_dump_named(solver, q, folder, name, impulse, seconds, method, NULL);
+}
+
+/* A problem that lav_load read: give `problem` to lav_set. Its arrays lie in memory that lav_unload frees. */
+typedef struct lav_loaded {
+  lav_problem problem;
+  double *impulse; /* (m) N s, the stored answer; null if the file has none */
+  double *gap;     /* (k) m; null if the file has none */
+  void *memory[LAV_DUMP_ENTRIES];
+  int32_t count, code;
+  const unsigned char *file;
+  size_t bytes;
+} lav_loaded;
+
+static inline void lav_unload(lav_loaded *x) {
+  while (x && x->count > 0) free(x->memory[--x->count]);
+}
+
+static inline void *lav_load_memory(lav_loaded *x, size_t bytes) {
+  void *found = x->count < LAV_DUMP_ENTRIES ? malloc(bytes + 8) : NULL;
+  if (found) x->memory[x->count++] = found;
+  else x->code = LAV_ERROR_WORKSPACE;
+  return found;
+}
+
+/* The number of 2 or 4 bytes at a place, the lowest byte first; 0 and an error behind the end of the file. */
+static inline size_t lav_load_number(lav_loaded *x, size_t at, int32_t width) {
+  size_t found = 0;
+  if (at > x->bytes || x->bytes - at < (size_t)width) return x->code = LAV_ERROR_FILE, (size_t)0;
+  for (; width > 0; width--) found = found << 8 | x->file[at + (size_t)width - 1];
+  return found;
+}
+
+/* The bytes of an entry of the archive; null if there is none, or if it is compressed. */
+static inline const unsigned char *lav_load_entry(lav_loaded *x, const char *name, size_t *bytes) {
+  const size_t wanted = strlen(name);
+  size_t end = x->bytes < 22 ? 0 : x->bytes - 22, at, length, n;
+  while (end > 0 && memcmp(x->file + end, "PK\5\6", 4)) end--;
+  at = lav_load_number(x, end + 16, 4);
+  for (n = lav_load_number(x, end + 10, 2); n > 0 && x->code == LAV_OK; n--) {
+    length = lav_load_number(x, at + 28, 2);
+    if (lav_load_number(x, at, 4) != 0x02014b50 || x->bytes - at < 46 + length) x->code = LAV_ERROR_FILE;
+    else if (length == wanted + 4 && !memcmp(x->file + at + 46, name, wanted)) {
+      const size_t is_packed = lav_load_number(x, at + 10, 2), start = lav_load_number(x, at + 42, 4);
+      const size_t head = 30 + lav_load_number(x, start + 26, 2) + lav_load_number(x, start + 28, 2);
+      *bytes = lav_load_number(x, at + 24, 4);
+      if (is_packed || x->code != LAV_OK || start > x->bytes || x->bytes - start < head || x->bytes - start - head < *bytes) break;
+      return x->file + start + head;
+    }
+    at += 46 + length + lav_load_number(x, at + 30, 2) + lav_load_number(x, at + 32, 2);
+  }
+  if (n > 0) x->code = LAV_ERROR_FILE;
+  return NULL;
+}
+
+/* An array of doubles ('f'), int32 ('i'), uint64 ('u') or bytes ('b') with `count` numbers, which is found if it is -1. Null
+ * without such an entry, which is an error if it is needed. */
+static inline void *lav_load_array(lav_loaded *x, const char *name, char kind, int64_t *count, int32_t is_needed) {
+  const uint16_t one = 1;
+  const unsigned char *data = NULL, *from;
+  char head[512], *at;
+  size_t bytes = 0, skip, n = 1, width, i;
+  void *to;
+  from = x->code == LAV_OK ? lav_load_entry(x, name, &bytes) : NULL;
+  if (!from && is_needed && x->code == LAV_OK) x->code = LAV_ERROR_FILE;
+  if (!from || x->code != LAV_OK) return NULL;
+  x->code = LAV_ERROR_FILE;
+  if (bytes < 12 || memcmp(from, "\x93NUMPY", 6)) return NULL;
+  skip = from[6] == 1 ? 10 + from[8] + 256 * (size_t)from[9] : bytes;
+  if (skip > bytes || skip - 10 >= sizeof head) return NULL;
+  memcpy(head, from + 10, skip - 10), head[skip - 10] = 0, data = from + skip;
+  at = strstr(head, "'descr': '");
+  if (!at || strlen(at) < 14 || !strstr(head, "'fortran_order': False")) return NULL;
+  width = (size_t)(at[12] - '0');
+  if (at[10] != (width == 1 ? '|' : *(const char *)&one ? '<' : '>')) return NULL;
+  if (!(kind == 'f' ? at[11] == 'f' && width == 8 : kind == 'u' ? at[11] == 'u' && width == 8 : kind == 'b' ? at[11] == 'u' && width == 1
+        : at[11] == 'i' && (width == 1 || width == 4 || width == 8))) return NULL;
+  {
+    const char *shape = strstr(head, "'shape': (");
+    if (!shape) return NULL;
+    for (shape += 10; *shape && *shape != ')';) {
+      char *next;
+      const unsigned long size = strtoul(shape, &next, 10);
+      if (next == shape) shape++;
+      else if (size > 0x7fffffff || (n *= size) > 0x7fffffff) return NULL;
+      else shape = next;
+    }
+  }
+  if (n * width > bytes - skip || (*count >= 0 && n != (size_t)*count)) return NULL;
+  *count = (int64_t)n;
+  x->code = LAV_OK;
+  to = lav_load_memory(x, n * (kind == 'i' ? 4 : width) + 1);
+  if (!to) return NULL;
+  if (kind != 'i' || width == 4) memcpy(to, data, n * width);
+  else
+    for (i = 0; i < n; i++) {
+      int64_t value = (signed char)data[i * width];
+      if (width == 8) memcpy(&value, data + 8 * i, 8);
+      if (value < -0x7fffffff || value > 0x7fffffff) return x->code = LAV_ERROR_FILE, (void *)NULL;
+      ((int32_t *)to)[i] = (int32_t)value;
+    }
+  if (kind == 'b') ((char *)to)[n] = 0;
+  return to;
+}
+
+static inline double *lav_load_reals(lav_loaded *x, const char *name, int64_t count, int32_t is_needed) {
+  return (double *)lav_load_array(x, name, 'f', &count, is_needed);
+}
+
+static inline int32_t *lav_load_whole(lav_loaded *x, const char *name, int64_t count) {
+  return (int32_t *)lav_load_array(x, name, 'i', &count, 1);
+}
+
+/* Read a file of lav_dump, or an uncompressed one of the package, from which lav_set sets the same problem. LAV_ERROR_FILE: it
+ * cannot be read, is compressed, or is no problem; LAV_ERROR_UNSUPPORTED: a quadratic program, or joints of several blocks. */
+static inline int32_t lav_load(const char *path, lav_loaded *out) {
+  lav_problem *q;
+  int32_t *ptr, *joints = NULL, is_bodies, general, k, m = 0, i, j, n;
+  int64_t count = 1, entries = -1;
+  const char *meta, *law;
+  unsigned char *file = NULL;
+  FILE *stream;
+  size_t bytes;
+  long size = -1;
+  if (!path || !out) return LAV_ERROR_NULL;
+  memset(out, 0, sizeof *out);
+  q = &out->problem;
+  if (!(stream = fopen(path, "rb"))) return LAV_ERROR_FILE;
+  if (!fseek(stream, 0, SEEK_END)) size = ftell(stream);
+  if (size > 0 && !fseek(stream, 0, SEEK_SET) && (file = (unsigned char *)malloc((size_t)size)) != NULL)
+    if (fread(file, (size_t)size, 1, stream) == 1) out->file = file, out->bytes = (size_t)size;
+  fclose(stream);
+  out->code = out->file ? LAV_OK : LAV_ERROR_FILE;
+  if (out->code == LAV_OK && !lav_load_entry(out, "lavender_format", &bytes)) out->code = LAV_ERROR_FILE;
+  meta = (const char *)lav_load_array(out, "meta", 'b', &entries, 1);
+  is_bodies = meta && !strncmp(meta, "{\"operator\": \"rows\"", 19);
+  general = meta && !strncmp(meta, "{\"operator\": \"generalized\"", 26);
+  if (meta && !is_bodies && !general && strncmp(meta, "{\"operator\": \"csr\"", 18) && strncmp(meta, "{\"operator\": \"dense\"", 20))
+    out->code = LAV_ERROR_UNSUPPORTED;
+  law = out->code == LAV_OK ? strstr(meta, "\"friction\": \"") : NULL;
+  lav_default_problem(is_bodies ? LAV_BODIES : general ? LAV_VELOCITIES : LAV_MATRIX, q);
+  q->law = law && !strncmp(law + 13, "cone", 4) ? LAV_CONE : LAV_COULOMB;
+  entries = -1;
+  ptr = (int32_t *)lav_load_array(out, "cones_ptr", 'i', &entries, 1);
+  k = out->code == LAV_OK && entries > 0 ? (int32_t)entries - 1 : -1;
+  if (k >= 0) m = ptr[k];
+  else if (out->code == LAV_OK) out->code = LAV_ERROR_FILE;
+  if (out->code == LAV_OK && m < 0) out->code = LAV_ERROR_FILE;
+  q->n_blocks = k, q->n_rows = m, q->block_ptr = ptr;
+  q->b = lav_load_reals(out, "b", m, 1);
+  q->kind = lav_load_whole(out, "cones_kind", k);
+  q->lower = lav_load_reals(out, "cones_lower", m, 1);
+  q->upper = lav_load_reals(out, "cones_upper", m, 1);
+  q->mu = lav_load_reals(out, "cones_mu", k, 1);
+  q->patch_radius = lav_load_reals(out, "cones_patch_radius", k, 1);
+  q->rolling = lav_load_reals(out, "cones_rolling", k, 0);
+  q->impulse = lav_load_reals(out, "guess", m, 0);
+  out->impulse = lav_load_reals(out, "impulse", m, 0);
+  out->gap = lav_load_reals(out, "gap", k, 0);
+  count = k;
+  q->key = (const uint64_t *)lav_load_array(out, "key", 'u', &count, 0);
+  if (is_bodies || general) q->compliance = lav_load_reals(out, "compliance", m, 1);
+  count = entries = -1;
+  if (is_bodies) {
+    q->inv_mass = (double *)lav_load_array(out, "rows_inv_mass", 'f', &count, 1);
+    joints = (int32_t *)lav_load_array(out, "rows_joint_ptr", 'i', &entries, 1);
+    q->n_bodies = n = (int32_t)count, q->n_joints = j = out->code == LAV_OK ? (int32_t)entries - 1 : 0;
+    for (i = 0; i <= j && out->code == LAV_OK; i++)
+      if (j > k || joints[i] != ptr[i]) out->code = LAV_ERROR_UNSUPPORTED;
+    q->inv_inertia = lav_load_reals(out, "rows_inv_inertia", 9 * (int64_t)n, 1);
+    q->velocity = lav_load_reals(out, "rows_v_free", 6 * (int64_t)n, 1);
+    q->jac = lav_load_reals(out, "rows_jac", joints && out->code == LAV_OK ? 12 * (int64_t)joints[j] : 0, 1);
+    q->joint_body = lav_load_whole(out, "rows_joint_body", 2 * (int64_t)j);
+    q->contact_body = lav_load_whole(out, "rows_contact_body", 2 * ((int64_t)k - j));
+    q->normal = lav_load_reals(out, "rows_normal", 3 * ((int64_t)k - j), 1);
+    q->tangent = lav_load_reals(out, "rows_tangent", 3 * ((int64_t)k - j), 1);
+    q->arm_a = lav_load_reals(out, "rows_arm_a", 3 * ((int64_t)k - j), 1);
+    q->arm_b = lav_load_reals(out, "rows_arm_b", 3 * ((int64_t)k - j), 1);
+  } else if (general) {
+    int32_t *low, *index;
+    double *value;
+    q->velocity = (double *)lav_load_array(out, "general_v_free", 'f', &count, 1);
+    q->n_velocities = n = (int32_t)count;
+    q->index_ptr = lav_load_whole(out, "general_jac_indptr", (int64_t)m + 1);
+    q->value = (double *)lav_load_array(out, "general_jac_data", 'f', &entries, 1);
+    q->n_entries = (int32_t)entries;
+    q->index = lav_load_whole(out, "general_jac_indices", entries);
+    low = lav_load_whole(out, "general_mass_indptr", (int64_t)n + 1);
+    entries = -1;
+    value = (double *)lav_load_array(out, "general_mass_data", 'f', &entries, 1);
+    index = lav_load_whole(out, "general_mass_indices", entries);
+    if (low) low[0] = 0;
+    for (i = j = 0, count = 0; i < n && out->code == LAV_OK; i++, low[i] = j) /* the lower triangle */
+      for (; count < low[i + 1]; count++)
+        if (count < 0 || count >= entries) out->code = LAV_ERROR_FILE, count = low[i + 1];
+        else if (index[count] <= i) value[j] = value[count], index[j++] = index[count];
+    q->mass_ptr = low, q->mass_index = index, q->mass_value = value, q->n_mass_entries = j;
+  } else if (meta && !strncmp(meta, "{\"operator\": \"csr\"", 18)) {
+    q->index_ptr = lav_load_whole(out, "A_indptr", (int64_t)m + 1);
+    q->value = (double *)lav_load_array(out, "A_data", 'f', &entries, 1);
+    q->n_entries = (int32_t)entries;
+    q->index = lav_load_whole(out, "A_indices", entries);
+  } else {
+    q->value = lav_load_reals(out, "A", (int64_t)m * m, 1);
+    q->n_entries = out->code == LAV_OK ? m * m : 0;
+  }
+  free(file);
+  out->file = NULL, out->bytes = 0;
+  if (out->code != LAV_OK) lav_unload(out);
+  return out->code;
 }
 
 #endif
