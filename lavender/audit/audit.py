@@ -321,7 +321,7 @@ def _audit_model(
     states = sorted(result.contact_states, key=lambda entry: entry[:2])
     result.contact_states[:] = [s for s in states if s.step < last.get(s.world, np.inf)]
     if not result.is_stopped:
-        result.causes = explain_steps(runs, [(w.world, w.step) for w in result.worst])
+        result.causes, result.slide = explain_steps(runs, [(w.world, w.step) for w in result.worst])
     return result
 
 

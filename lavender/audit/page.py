@@ -164,6 +164,9 @@ def make_audit_page(audit: Any, folder: Path | None) -> Page:
     code = []
     if counts.above and audit.engine == "mujoco" and not audit.divergences and runs.source:
         code = [format_next_command(audit, counts.limit)]
+    elif counts.slides and runs.source:
+        states = str(audit.folder / "slip.npz")
+        code = [shlex.join(["lavender", "slip", runs.source, "--states", states])]
     starts = f"seed {runs.seed}, start velocities ± {runs.spread:g} m/s"
     files = "records.npz (every step), numbers.json, states.npz, worst/, forces.csv, figures/ (PDF, SVG, PNG)"
     footer = [f"{starts}. Files: {files}."]
@@ -276,8 +279,22 @@ class AuditCounts:
         causes = self.audit.causes
         laws = max(causes, key=lambda x: abs(x.difference)).sentence if causes else ""
         against = self.audit.compare_in_words()
-        texts = self._describe_place(), self._describe_cause(), laws, against
+        slide = self.audit.slide
+        sliding = ""
+        if self.slides and slide is not None:
+            sliding = (
+                f"The solves are right, and contacts slide that would not by the rigid laws: {slide.contact} with "
+                f"{format_speed(slide.speed)} in step {slide.step} of world {slide.world}. `lavender slip` says why."
+            )
+        texts = self._describe_place(), self._describe_cause(), laws, sliding, against
         return [*filter(None, texts)]
+
+    @property
+    def slides(self) -> bool:
+        """Whether a contact slides faster than the limit although no error exceeds it."""
+        slide = self.audit.slide
+        is_fast = slide is not None and slide.speed > self.limit
+        return is_fast and not self.above and not self.audit.divergences
 
     def _describe_place(self) -> str:
         """Return the worst step and row, the worlds above the limit, and whether errors grow with time."""

@@ -26,7 +26,7 @@ from lavender.audit.pieces import (
     Worst,
 )
 from lavender.audit.provenance import describe_provenance, format_provenance
-from lavender.audit.rigid_laws import StepCauses
+from lavender.audit.rigid_laws import Slide, StepCauses
 from lavender.audit.simulated_worlds import Divergence, Runs, can_any_geoms_collide
 from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
@@ -104,6 +104,7 @@ class Audit:
     step_forces: list[pd.DataFrame] = field(default_factory=list)  # See `Piece.forces`.
     # Causes of the worst steps, then of the step with the largest difference from the rigid laws; of MuJoCo only.
     causes: list[StepCauses] = field(default_factory=list)
+    slide: Slide | None = None  # The fastest contact that would not slide by the rigid laws.
     against: Audit | None = None  # Result of another model on the same states.
     provenance: dict[str, Any] = field(default_factory=dict)  # Result of `describe_provenance`.
     folder: Path = Path("lavender-audit")  # To which `write` wrote.
@@ -428,6 +429,8 @@ class Audit:
             gap = self._read_gaps(w)
             write_npz(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse, gap=gap)
         self.save_states("worst", folder / "states.npz")
+        if AuditCounts(self).slides and self.slide is not None:
+            write_arrays(folder / "slip.npz", {VECTOR: self.slide.state[None]})
         records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
         records |= {"rows": self.rows, "contacts": self.contacts}

@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lavender.audit.bodies import get_geoms
 from lavender.audit.simulated_worlds import Runs, simulate_world
+from lavender.audit.slip import name_blocks, read_slip
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
 from lavender.causes.comparison import Comparison, compare
@@ -23,6 +25,9 @@ COMPARED_STEPS = 6
 # Larger steps are not compared: each one has up to 100 exact solutions.
 MAX_ROWS, MAX_VELOCITIES = 300, 120
 MIN_SHOWN_PART = 0.05  # [-] Parts below this fraction of the difference are not listed.
+MAX_RIGID_SHARE = (
+    0.1  # [-] A contact with at most this part of its speed would not slide by the rigid laws.
+)
 OWN_PARTS = ("solver", "lost digits", "noslip")
 
 
@@ -60,8 +65,23 @@ def format_signed(x: float) -> str:
     return ("+" if x >= 0.0 else "-") + format_size(abs(x))
 
 
-def explain_steps(runs: Runs, worst: Iterable[tuple[int, int]]) -> list[StepCauses]:
+class Slide(NamedTuple):
+    """A contact that slides after a step, and would not by the rigid laws."""
+
+    world: int
+    step: int
+    contact: str
+    speed: float  # [m/s]
+    rigid: float  # [m/s] By the rigid laws.
+    state: FloatArray  # Vector of mjSTATE_INTEGRATION before the step.
+
+
+def explain_steps(
+    runs: Runs, worst: Iterable[tuple[int, int]]
+) -> tuple[list[StepCauses], Slide | None]:
     """Return the causes of the worst steps, then of the evenly spaced step with the largest difference.
+
+    The second result is the contact of these steps that slides fastest where it would not by the rigid laws.
 
     Parameters
     ----------
@@ -70,24 +90,31 @@ def explain_steps(runs: Runs, worst: Iterable[tuple[int, int]]) -> list[StepCaus
     worst : (world, step) of the worst steps
     """
     if runs.model.nv > MAX_VELOCITIES or runs.model.nv == 0:
-        return []
+        return [], None
     wanted = list(worst)
     # The first worlds; world 0 starts without the spread of the velocities.
     first = range(min(runs.worlds, 2))
     states = {
         w: simulate_world(runs, w)[0] for w in dict.fromkeys([*(w for w, _ in wanted), *first])
     }
-    found = [x for x in (_explain(runs, states, w, k) for w, k in wanted) if x is not None]
+    slides: list[Slide] = []
+    found = [x for x in (_explain(runs, states, w, k, []) for w, k in wanted) if x is not None]
     steps = np.unique(np.linspace(0, runs.steps - 1, COMPARED_STEPS).astype(int))
     spaced = [
-        x for w in first for k in steps if (x := _explain(runs, states, w, int(k))) is not None
+        x
+        for w in first
+        for k in steps
+        if (x := _explain(runs, states, w, int(k), slides)) is not None
     ]
     spaced.sort(key=lambda x: -abs(x.difference))
-    return found + [x for x in spaced[:1] if x.parts]
+    fastest = max(slides, key=lambda x: x.speed, default=None)
+    return found + [x for x in spaced[:1] if x.parts], fastest
 
 
-def _explain(runs: Runs, states: dict[int, FloatArray], world: int, step: int) -> StepCauses | None:
-    """Return the causes of one step; None if it cannot be compared or has no constraints."""
+def _explain(
+    runs: Runs, states: dict[int, FloatArray], world: int, step: int, slides: list[Slide]
+) -> StepCauses | None:
+    """Return the causes of one step, and add its sliding contacts; None if it cannot be compared."""
     state = states[world][step]
     if not np.isfinite(state).all():
         return None
@@ -98,7 +125,15 @@ def _explain(runs: Runs, states: dict[int, FloatArray], world: int, step: int) -
         record = step_from_mujoco(model, data)
         if not record.blocks or record.n_rows > MAX_ROWS:
             return None
-        return describe_step(compare(record), world, step)
+        comparison = compare(record)
+        for name, block in zip(name_blocks(record), record.blocks, strict=True):
+            if block.has_friction:
+                rows, surface = read_slip(block)
+                velocities = record.velocity_after, comparison.a.velocity_after
+                speed, rigid = (float(np.linalg.norm(rows @ v - surface)) for v in velocities)
+                if rigid <= MAX_RIGID_SHARE * speed:
+                    slides.append(Slide(world, step, get_geoms(name), speed, rigid, state))
+        return describe_step(comparison, world, step)
     except (LavenderError, mj.FatalError, np.linalg.LinAlgError):
         return None
 

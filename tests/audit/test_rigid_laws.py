@@ -1,11 +1,14 @@
 """The causes that an audit names: of errors against the engine's own problem, and against the rigid laws."""
 
+import shlex
+
 import numpy as np
 import pytest
 
 from lavender.audit.audit import audit
 from lavender.audit.idle_settings import list_idle_settings
 from lavender.audit.settings import MujocoSetting
+from lavender.audit.slip_states import explain_slip_of_states
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
@@ -79,3 +82,30 @@ def step_velocity(model, state, kind):
     mujoco.mj_setState(model, data, state, kind)
     mujoco.mj_step(model, data)
     return np.array(data.qvel)
+
+
+@pytest.mark.parametrize("friction", [0.4, 0.1])
+def test_audit_names_slip_if_a_contact_creeps_although_every_solve_is_right(friction, tmp_path):
+    """A box on a slope creeps by softness; above the friction angle it slides by the rigid laws, too."""
+    path = tmp_path / "my models" / "slope.xml"
+    path.parent.mkdir()
+    path.write_text(f"""<mujoco><option timestep="0.002" cone="elliptic" gravity="2 0 -9.6"/><worldbody>
+      <geom name="slope" type="plane" size="9 9 .1" friction="{friction} 0.005 0.0001"/>
+      <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05"
+      friction="{friction} 0.005 0.0001"/></body></worldbody></mujoco>""")
+    result = audit(path, worlds=1, steps=200, workers=1, max_velocity_error=1e-5)
+    out = tmp_path / "out"
+    result.write(out)
+    page = result.page.make_page(None)
+    text = " ".join(page.sentences)
+    assert not result.is_unconverged.any()
+    if friction < 0.2:
+        assert "lavender slip" not in text and not page.code and not (out / "slip.npz").exists()
+        return
+    assert "The solves are right, and contacts slide" in text and "slope, box" in text
+    (command,) = page.code
+    words = shlex.split(command)
+    assert words[:3] == ["lavender", "slip", str(path)]
+    found = explain_slip_of_states(words[2], words[4])
+    assert f"{result.slide.speed:.6e}" == f"{found.explanations[0].speeds.max():.6e}"
+    assert found.slips["cause"][0] == "softness"
