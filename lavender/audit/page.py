@@ -204,14 +204,16 @@ class AuditCounts:
         at_floor = audit.verdict == VERDICTS.index(AT_FLOOR)
         self.sizes = np.where(at_floor, 0.0, self.errors)  # Steps at their floor never count.
         errors = self.errors[audit.is_judged & ~at_floor]
-        close, within = (int((errors <= limit).sum()) for limit in (audit.threshold, self.limit))
+        # The smallest class stays below the limit.
+        close_to = audit.threshold if audit.threshold < self.limit else 0.1 * self.limit
+        close, within = (int((errors <= limit).sum()) for limit in (close_to, self.limit))
         with np.errstate(invalid="ignore"):
             self.is_above = self.sizes > self.limit
         self.n = audit.n_judged
         self.above = int(self.is_above.sum())
         self.classes = [
             ("rounding only", int((at_floor & audit.is_judged).sum())),
-            (f"up to {format_speed(audit.threshold)}", close),
+            (f"up to {format_speed(close_to)}", close),
             (f"up to {format_speed(self.limit)}: the limit", max(within - close, 0)),
             (f"more than {format_speed(self.limit)}", self.above),
         ]

@@ -47,7 +47,7 @@ from lavender.report.text import (
 )
 
 PAIR_HEADS = [
-    "bodies", "steps", "mean force [N]", "median error [N]", "error of 1 % [N]", "largest error [N]",
+    "bodies", "steps", "mean force [N]", "median error [N]", "99 % error [N]", "largest error [N]",
     "sum determined", "contacts determined",
 ]  # fmt: skip
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)

@@ -527,6 +527,8 @@ def check_problem(problem: Any) -> None:
         if isinstance(getattr(problem, "problem", None), ProblemData):
             # The object is a case, or the result of reading a file.
             advice = "give its .problem"
+        elif callable(getattr(problem, "get_world", None)):
+            advice = "give one of its worlds, batch[i]"
         elif callable(getattr(problem, "velocity_after", None)):
             # The object is a `RowBuilder`, which is not imported here.
             advice = "give the result of its .problem()"

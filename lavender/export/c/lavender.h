@@ -67,7 +67,7 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact of the world with the world: leave it out */
   LAV_ERROR_FRAME = -18,      /* normal and tangent of a contact are no orthogonal unit vectors, to 1e-5: divide each by its length */
   LAV_ERROR_FACTOR = -19,     /* newton's factor over bodies has 2^31 rows of blocks or more: take sweeps or anderson, or solve islands separately */
-  LAV_ERROR_FILE = -20        /* a file cannot be written, by lav_dump alone: is there such a folder, and is there workspace? */
+  LAV_ERROR_FILE = -20        /* lav_dump cannot write a file (is there such a folder, is there workspace?), or lav_load read it (is it one of lav_dump, uncompressed?) */
 };
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */
