@@ -33,6 +33,7 @@ from lavender.io.step_record import (
     add_forces,
     add_matrix,
 )
+from lavender.io.stiff_rows import raise_compliance
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.solving.solve import solve
@@ -93,9 +94,14 @@ def solve_mixture(
     step = assemble(sources, pairing, velocity)
     if step.problem is None:
         return Mixture(step.free, 0.0, True)
-    best = None
+    best, problem = None, step.problem
+    # Rows that hardly move anything, as of a wheel's contact under its axle, have a compliance near 0 beside their own
+    # numbers: they are solved as `from_mujoco` gives them.
+    raised = raise_compliance(problem)
+    if raised is not None:
+        problem = replace(problem, compliance=raised)
     for solver in SOLVERS:
-        solution = solve(step.problem, solver, tol=TOL)
+        solution = solve(problem, solver, tol=TOL)
         if best is None or solution.residual.relative < best.residual.relative:
             best = solution
         if best.residual.relative <= MAX_RESIDUAL:

@@ -434,3 +434,17 @@ def test_problem_of_a_record_is_the_problem_that_mujoco_solves(name, integrator,
         step.velocity_of(impulse), record.velocity_after, rtol=0,
         atol=1e-9 * max(1.0, np.abs(record.velocity_after).max()),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("condim", [3, 4])
+def test_wheel_under_its_axle_has_causes(condim):
+    """The contact hardly moves the wheel, so that MuJoCo's compliance of its rows is 1e-15."""
+    text = f"""<mujoco><option tolerance="0" iterations="200"/><worldbody><geom type="plane" size="9 9 .1"/>
+    <body pos="0 0 .0495"><joint axis="0 1 0" frictionloss=".1"/><geom size=".05" mass="1" condim="{condim}"/></body>
+    </worldbody></mujoco>"""
+    found = lv.compare(read_text(text))
+    total = sum(p.mean for p in found.parts.values())
+    np.testing.assert_allclose(total, found.difference, rtol=0, atol=1e-12)
+    assert np.abs(found.parts["softness"].mean).max() > 0.1
+    # Rounding of such rows in float64.
+    assert np.abs(found.parts["solver"].mean).max() < 1e-6
