@@ -156,18 +156,13 @@ cdef inline void rotate_arm_to_body(const engine_t* e, int32_t body, const doubl
         copy3(arm, out)
 
 
-cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b, const manifold_t* m,
-                               int32_t at, const double* tangent, int32_t nt, int32_t n_angular) noexcept nogil:
-    """Fill rows row .. row + nt + n_angular of contact c from point `at` of the manifold, except for the target."""
-    cdef double off[2]
-    cdef double w[6]
-    cdef int32_t k, roll = row + nt + n_angular - 1, da = e.dyn[a], db = e.dyn[b]
-    cdef double* d = e.d + row
-    # bodies, key and geometry
+cdef inline void build_contact(engine_t* e, int32_t c, int32_t a, int32_t b, const manifold_t* m, int32_t at,
+                               const double* tangent, int32_t nt) noexcept nogil:
+    """Write bodies, key and geometry of contact c from point `at` of the manifold; its rows are built later."""
     e.contact_pair[2 * c] = a
     e.contact_pair[2 * c + 1] = b
-    e.contact_body[2 * c] = da
-    e.contact_body[2 * c + 1] = db
+    e.contact_body[2 * c] = e.dyn[a]
+    e.contact_body[2 * c + 1] = e.dyn[b]
     e.key[c] = make_contact_key(a, b, m.feature[at])
     e.gap[c] = m.gap[at]
     copy3(m.point + 3 * at, e.point + 3 * c)
@@ -178,17 +173,23 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
     rotate_arm_to_body(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
         copy3(tangent, e.tangent + 3 * c)
-    # diagonal of A and w* = J v*; the common kind has constant sizes, so that the compiler unrolls its loops
+
+
+cdef inline void build_contact_rows(engine_t* e, int32_t c, int32_t nt, int32_t n_angular) noexcept nogil:
+    """Compute the diagonal of A, the couplings and the step sizes of contact c."""
+    cdef double off[2]
+    cdef int32_t k, row = e.ptr[e.size[N_JOINT] + c], roll = row + nt + n_angular - 1
+    cdef int32_t da = e.contact_body[2 * c], db = e.contact_body[2 * c + 1]
+    cdef double* d = e.d + row
+    # The common kind has constant sizes, so that the compiler unrolls its loops.
     if nt == 2 and not n_angular:
         compute_contact_delassus_block(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
                          e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
-        compute_contact_velocity(r, c, 2, 0, e.v_free, w)
     else:
         compute_contact_delassus_block(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, n_angular,
                          da, db, e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
-        compute_contact_velocity(r, c, nt, n_angular, e.v_free, w)
     for k in range(1 + nt + n_angular):
         d[k] += e.compliance[row + k]
     # step sizes: separate tangents for box friction, else one step from the tangents' largest eigenvalue
@@ -203,10 +204,6 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
         e.step[row + 1 + nt] = reciprocal_or_zero(d[1 + nt])
     if n_angular & 2:
         finish_pair(largest_eigenvalue_2x2(e.d[roll], off[1], e.d[roll + 1]), e.d + roll, e.step + roll)
-    # right-hand side with target 0
-    for k in range(1 + nt + n_angular):
-        e.target[row + k] = 0.0
-        e.b[row + k] = 0.0 - w[k]
 
 
 cdef inline void set_contact_target(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
@@ -238,7 +235,6 @@ cdef inline int32_t is_contact_order_reversed(const engine_t* e) noexcept nogil:
 cdef struct pair_properties_t:      # what the contacts of a pair have in common
     double mu                       # -
     double patch                    # m
-    double bounce                   # -
     int32_t n_tangents
     int32_t n_angular               # bit 0: a spin row, bit 1: two rolling rows
 
@@ -247,7 +243,6 @@ cdef inline pair_properties_t combine_materials(const engine_t* e, int32_t a, in
     """Return the properties of the contacts of bodies a and b."""
     cdef pair_properties_t out
     out.mu = sqrt(e.friction[a] * e.friction[b])
-    out.bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
     out.patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
     out.n_tangents = 2 if out.mu > 0.0 else 0
     out.n_angular = 0
@@ -261,9 +256,9 @@ cdef inline int32_t count_contact_rows(const pair_properties_t* x) noexcept nogi
     return 1 + x.n_tangents + (x.n_angular & 1) + (x.n_angular & 2)
 
 
-cdef inline int32_t add_contacts_of_pair(engine_t* e, const rows_t* r, int32_t a, int32_t b, const manifold_t* m, int32_t c,
-                                         int32_t row, int32_t* first) noexcept nogil:
-    """Build contacts c .. c + m.n - 1 of a pair from `row` on, warm-started from the cache; return how many were matched.
+cdef inline int32_t add_contacts_of_pair(engine_t* e, int32_t a, int32_t b, const manifold_t* m, int32_t c, int32_t row,
+                                         int32_t* first) noexcept nogil:
+    """Add contacts c .. c + m.n - 1 of a pair from `row` on, warm-started from the cache; return how many were matched.
 
     `first` is the cache entry at which the search for the pair begins.
     """
@@ -276,7 +271,7 @@ cdef inline int32_t add_contacts_of_pair(engine_t* e, const rows_t* r, int32_t a
     if x.n_tangents > 0:
         compute_tangent(m.normal, tangent)
     for j in range(m.n):
-        build_contact(e, r, c, row, a, b, m, m.n - 1 - j if last_first else j, tangent, x.n_tangents, x.n_angular)
+        build_contact(e, c, a, b, m, m.n - 1 - j if last_first else j, tangent, x.n_tangents)
         block = e.size[N_JOINT] + c
         e.kind[block] = choose_contact_kind(box, x.n_angular & 1, x.n_angular & 2, x.n_tangents)
         e.mu[block] = x.mu
@@ -300,13 +295,11 @@ cdef inline int32_t add_contacts_of_pair(engine_t* e, const rows_t* r, int32_t a
                 k = e.ptr[e.size[N_JOINT] + start + j]
                 warm_start_contact(e, start + j, entry[j], x.n_tangents, x.n_angular, e.impulse + k)
                 matches += 1
-    for j in range(start, c):
-        set_contact_target(e, j, e.ptr[e.size[N_JOINT] + j], a, b, x.bounce)
     return matches
 
 
-cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
-    """Build all contacts of the pair list, warm-started from the cache, and return their number."""
+cdef inline int32_t build_contacts(engine_t* e) noexcept nogil:
+    """Build all contacts of the pair list without their rows, warm-started from the cache, and return their number."""
     cdef manifold_t m
     cdef int32_t i, k, a, b, c = 0, row = e.size[N_JOINT_ROW], matches = 0, last_first = is_contact_order_reversed(e)
     cdef int32_t first = e.head[H_CACHED] if last_first else 0
@@ -323,19 +316,21 @@ cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         if m.n == 0:
             continue
         if c + m.n <= e.size[CAP_CONTACT]:
-            matches += add_contacts_of_pair(e, r, a, b, &m, c, row, &first)
+            matches += add_contacts_of_pair(e, a, b, &m, c, row, &first)
             row = e.ptr[e.size[N_JOINT] + c + m.n]
         c += m.n                                        # Only count contacts beyond the capacity.
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c
         e.head[H_CONTACT_ROWS] = row - e.size[N_JOINT_ROW]
         e.head[H_MATCHES] = matches
+        for i in range(c):
+            e.order_scratch[i] = -1                     # every contact is new
     return c
 
 
-cdef inline int32_t follow_gaps(engine_t* e, int32_t shifted) noexcept nogil:
-    """Move the gaps of all contacts by (5) after the bodies have moved, and return whether a body is due."""
-    cdef int32_t i, k, b, c, any_due = 0
+cdef inline int32_t find_due_bodies(engine_t* e, int32_t shifted) noexcept nogil:
+    """Write the displacement of the bodies to e.shift after they have moved, and return whether a body is due, (5)."""
+    cdef int32_t i, k, b, any_due = 0
     cdef double h = e.setting[S_H], step, radius, limit
     cdef double* s
     cdef const double* size
@@ -360,9 +355,14 @@ cdef inline int32_t follow_gaps(engine_t* e, int32_t shifted) noexcept nogil:
             e.due[b] = e.dyn[b] >= 0
     for i in range(e.size[N_BODY]):
         any_due |= e.due[i]
+    return any_due
+
+
+cdef inline void follow_gaps(engine_t* e) noexcept nogil:
+    """Move the gaps of all contacts by (5)."""
+    cdef int32_t c
     for c in range(e.head[H_CONTACTS]):
         e.gap[c] += contact_normal_velocity(e, e.shift, c)
-    return any_due
 
 
 cdef inline void move_doubles(double* x, int32_t n, int32_t source, int32_t goal) noexcept nogil:
@@ -407,7 +407,7 @@ cdef inline void move_contact_rows(engine_t* e, int32_t n, int32_t source, int32
 
 
 cdef inline void refresh_contact(engine_t* e, const blocks_t* p, const rows_t* r, int32_t c) noexcept nogil:
-    """Write the right-hand side of a kept contact for the present velocities, gap and impulse."""
+    """Write the right-hand side of a contact for the present velocities, gap and impulse."""
     cdef double w[6]
     cdef int32_t block = e.size[N_JOINT] + c, row = e.ptr[block], k, n = e.ptr[block + 1] - row
     cdef int32_t a = e.contact_pair[2 * c], b = e.contact_pair[2 * c + 1]
@@ -463,8 +463,8 @@ cdef inline int32_t plan_kept_contacts(engine_t* e, int32_t* source, int32_t* ne
     return c
 
 
-cdef inline int32_t renew_contacts(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Keep the contacts whose bodies are not due, and build the others anew; return their number."""
+cdef inline int32_t renew_contacts(engine_t* e) noexcept nogil:
+    """Keep the contacts whose bodies are not due, and build the others anew without their rows; return their number."""
     cdef manifold_t m
     cdef int32_t* source = e.order_scratch
     cdef int32_t* new_row = source + e.size[CAP_CONTACT]
@@ -497,15 +497,10 @@ cdef inline int32_t renew_contacts(engine_t* e, const blocks_t* p, const rows_t*
         e.ptr[kj + n] = e.size[N_JOINT_ROW] + n_rows
         e.head[H_CONTACTS] = n
         e.head[H_CONTACT_ROWS] = n_rows
-        e.head[H_MATCHES] = 0
-    else:
-        e.head[H_MATCHES] = 0
-    # right-hand sides of the kept contacts
+    e.head[H_MATCHES] = 0
     for c in range(n):
-        if any_due and source[c] < 0:
-            continue
-        e.head[H_MATCHES] += e.head[H_WARM_START]
-        refresh_contact(e, p, r, c)
+        if not any_due or source[c] >= 0:
+            e.head[H_MATCHES] += e.head[H_WARM_START]
     # the others
     if any_due:
         c = 0
@@ -516,7 +511,7 @@ cdef inline int32_t renew_contacts(engine_t* e, const blocks_t* p, const rows_t*
             if e.due[a] or e.due[b]:
                 collide_bodies(e, a, b, e.setting[S_MARGIN], &m)
                 if m.n > 0:
-                    e.head[H_MATCHES] += add_contacts_of_pair(e, r, a, b, &m, c, new_row[c], &first)
+                    e.head[H_MATCHES] += add_contacts_of_pair(e, a, b, &m, c, new_row[c], &first)
                 c += m.n
             else:
                 while c < n and source[c] >= 0 and e.contact_pair[2 * c] == a and e.contact_pair[2 * c + 1] == b:
@@ -526,6 +521,16 @@ cdef inline int32_t renew_contacts(engine_t* e, const blocks_t* p, const rows_t*
                 e.moved[i] = 0.0
                 e.due[i] = 0
     return n
+
+
+cdef inline void finish_contacts(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
+    """Build the rows of the new contacts, and write the right-hand sides of all."""
+    cdef int32_t c, block
+    for c in range(e.head[H_CONTACTS]):
+        if e.head[H_REBUILT] and e.order_scratch[c] < 0:
+            block = e.size[N_JOINT] + c
+            build_contact_rows(e, c, count_tangent_rows(p, block), count_angular_rows(p, block))
+        refresh_contact(e, p, r, c)
 
 
 cdef inline void store_contact_cache(engine_t* e) noexcept nogil:

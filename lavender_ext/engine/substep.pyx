@@ -21,28 +21,29 @@ from lavender_ext.core.block cimport compute_row_error
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, find_block_levels, color_blocks_by_bodies,
                                       reverse_blocks, sort_blocks_by_level)
-from lavender_ext.core.block_types cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t, is_disk_friction_contact
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR,
-                                         COLORED, H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST,
-                                         H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER,
-                                         H_PHASE, H_REBUILT, H_SEED, H_SUBSTEPS, H_SOLVED, H_STEP,
-                                         H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC,
-                                         N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT,
-                                         SYMMETRICALLY, S_OUT, TOP_DOWN, bind_engine_arrays,
+from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
+                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS,
+                                         H_ORDER, H_PHASE, H_POSITION_ITERATIONS, H_PROJECTED, H_REBUILT, H_SEED, H_SOLVED,
+                                         H_STEP, H_SUBSTEPS, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_BODY, N_DYNAMIC,
+                                         N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_BETA,
+                                         S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_OUT, S_SLOP, TOP_DOWN, bind_engine_arrays,
                                          engine_t)
 from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
-from lavender_ext.engine.contacts cimport build_contacts, follow_gaps, renew_contacts, store_contact_cache
+from lavender_ext.engine.contacts cimport (build_contacts, find_due_bodies, finish_contacts, follow_gaps, renew_contacts,
+                                            store_contact_cache)
 from lavender_ext.engine.joints cimport build_joint_rows, store_joint_impulses
 from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
 from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
-from lavender_ext.sweep.manifolds cimport (bind_contacts, contacts_t, fits_lanes, free_manifolds, has_avx2, manifolds_t,
-                                           pack_manifolds, sweep_manifolds)
+from lavender_ext.sweep.manifolds cimport (HAS_MANIFOLDS, check_manifolds, contacts_t, follow_manifolds, free_manifolds, has_avx2,
+                                           manifolds_t, pack_manifolds, refresh_manifolds, store_manifolds, store_velocities,
+                                           sweep_manifolds, targets_t)
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, pack_blocks_in_order, packed_t, packed_workspace_size,
                                         refresh_packed_contacts, sweep_packed)
 from lavender_ext.sweep.pgs cimport sweep_bodies
@@ -52,12 +53,14 @@ cdef enum:
     MIN_PACKED_SWEEPS = 4       # Pack the blocks from this many sweeps on: packing costs as much as a few sweeps.
     MAX_UNROLLED_SWEEPS = 8     # Groups hold the manifolds of all sweeps of a substep up to this many sweeps,
     MIN_LANES = 2               # and must have this many manifolds on average.
+    MAX_POINTS = 4              # of a manifold
 
 
-cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
-    """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
-    cdef blocks_t p
-    cdef rows_t r
+cdef inline int32_t prepare_contacts(engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
+    """Build joint rows and contacts of the coming substep, contacts without rows; return OK or NEED_CAPACITY.
+
+    p and r receive the problem; `finish_contacts` completes it.
+    """
     cdef int32_t pairs, contacts
     e.head[H_SOLVED] = 0
     # bodies and pairs
@@ -66,15 +69,25 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     e.head[H_NEED_PAIRS] = pairs
     if pairs > e.size[CAP_PAIR]:
         return NEED_CAPACITY
-    # joint rows, contact rows
-    bind_substep_problem(e, &p, &r)
+    # joint rows, contacts
     if e.size[N_JOINT] > 0:
         build_joint_rows(e)
-    contacts = renew_contacts(e, &p, &r) if e.head[H_PHASE] > 0 else build_contacts(e, &r)
+    contacts = renew_contacts(e) if e.head[H_PHASE] > 0 else build_contacts(e)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
         return NEED_CAPACITY
+    bind_substep_problem(e, p, r)
     return OK
+
+
+cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
+    """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
+    cdef blocks_t p
+    cdef rows_t r
+    cdef int32_t status = prepare_contacts(e, &p, &r)
+    if status == OK:
+        finish_contacts(e, &p, &r)
+    return status
 
 
 cdef inline void measure_contact_errors(const engine_t* e, double* residual, double* violation) noexcept nogil:
@@ -201,16 +214,28 @@ cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
     return first_dynamic_body_of_pair(e, e.contact_pair) if c > 0 else e.body_of[0]
 
 
-cdef int32_t finish_substep(engine_t* e) noexcept nogil:
-    """Write the statistics, project and advance the bodies, prepare the next substep's contacts; return OK or NOT_FINITE."""
-    cdef int32_t shifted, nonfinite_body, last
+cdef inline void store_statistics(engine_t* e) noexcept nogil:
+    """Write the statistics of the sweeps, and the impulses of the joints for the next warm start."""
     cdef double* out = e.setting + S_OUT
-    # statistics
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
     out[2] = e.head[H_CONTACTS]
     out[3] = e.head[H_MATCHES]
     store_joint_impulses(e)
+
+
+cdef inline int32_t end_substep(engine_t* e) noexcept nogil:
+    """Count the substep; return OK or NOT_FINITE."""
+    e.head[H_PHASE] = 0 if e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS] else e.head[H_PHASE] + 1
+    e.head[H_SOLVED] = 1
+    e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
+    return OK if e.head[H_LOST] < 0 else NOT_FINITE
+
+
+cdef int32_t finish_substep(engine_t* e) noexcept nogil:
+    """Write the statistics, project and advance the bodies, prepare the next substep's contacts; return OK or NOT_FINITE."""
+    cdef int32_t shifted, nonfinite_body, any_due
+    store_statistics(e)
     # projection, integration
     nonfinite_body = find_nonfinite_body(e)
     shifted = project_positions(e)
@@ -218,13 +243,14 @@ cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
     # gaps and cache for the next substep
-    last = e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS]
-    if last or follow_gaps(e, shifted):
+    if e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS]:
         store_contact_cache(e)
-    e.head[H_PHASE] = 0 if last else e.head[H_PHASE] + 1
-    e.head[H_SOLVED] = 1
-    e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
-    return OK if e.head[H_LOST] < 0 else NOT_FINITE
+    else:
+        any_due = find_due_bodies(e, shifted)
+        follow_gaps(e)
+        if any_due:
+            store_contact_cache(e)
+    return end_substep(e)
 
 
 cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index, uint64_t* keys) noexcept nogil:
@@ -288,33 +314,31 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
 
 cdef struct packs_t:            # packed blocks of the substeps of a call: in odd phases the contacts are visited in reverse
     manifolds_t manifolds       # groups of manifolds, in the order of the substep `way`
-    bint has_manifolds          # the rows of these groups are those of the present substep
+    bint has_manifolds          # They hold the contacts of the present substep; the rows of the engine's arrays are out of date.
+    bint tried                  # It is known whether groups can hold the contacts.
+    bint stored                 # The arrays have these rows, too.
     int32_t way
+    int32_t lanes
     packed_t packed[2]          # pairs of blocks, for each order
     double* workspace[2]
     bint is_valid[2]
 
 
-cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t lanes, packs_t* packs) noexcept nogil:
-    """Run the sweeps over packed blocks, with the same bits, and return True, or return False if they cannot be packed.
+cdef inline int32_t get_sweep_direction(const engine_t* e) noexcept nogil:
+    """Return 1 if the substep visits the contacts in the reverse of the order in which they are numbered, else 0."""
+    return e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
 
-    Groups and pairs are used again in a later substep if all rows are still the same, except for the right-hand sides of contacts.
+
+cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, packs_t* packs) noexcept nogil:
+    """Run the sweeps over pairs of blocks, with the same bits, and return True, or return False if they cannot be packed.
+
+    Pairs are used again in a later substep if all rows are still the same, except for the right-hand sides of contacts.
     """
-    cdef int32_t way = e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0, sweeps = e.head[H_ITERATIONS]
-    cdef contacts_t contacts
+    cdef int32_t way = get_sweep_direction(e), sweeps = e.head[H_ITERATIONS]
     if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM or sweeps < MIN_PACKED_SWEEPS:
         return False                                    # The order changes from sweep to sweep, or packing does not pay.
     if e.head[H_REBUILT] or r.n_joints > 0:
-        packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
-        if lanes > 1 and fits_lanes(p, r):
-            contacts = bind_contacts(p, r, e.order)
-            packs.has_manifolds = pack_manifolds(&contacts, sweeps if sweeps <= MAX_UNROLLED_SWEEPS else 1, MIN_LANES,
-                                                 &packs.manifolds)
-            packs.way = way
-    if packs.has_manifolds:
-        contacts = bind_contacts(p, r, e.order)
-        sweep_manifolds(&contacts, &packs.manifolds, lanes == 4, sweeps, way != packs.way, e.impulse, e.dv)
-        return True
+        packs.is_valid[0] = packs.is_valid[1] = False
     if packs.is_valid[way]:
         refresh_packed_contacts(p, e.order, &packs.packed[way], e.impulse)
     elif not pack_blocks_in_order(p, r, e.order, False, packs.workspace[way], e.impulse, &packs.packed[way]):
@@ -324,28 +348,140 @@ cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_
     return True
 
 
-cdef inline void solve_packed_substep(engine_t* e, int32_t lanes, packs_t* packs, bint measures) noexcept nogil:
-    """Solve the substep's velocity problem as `solve_substep`, with the same bits, over packed blocks if that pays."""
-    cdef blocks_t p
-    cdef rows_t r
-    bind_substep_problem(e, &p, &r)
-    start_solve(e, &p, &r, measures)
+cdef inline contacts_t bind_contacts(const engine_t* e) noexcept nogil:
+    """Return the contacts of a scene without joints."""
+    cdef contacts_t c
+    cdef int32_t i
+    c.n, c.n_bodies, c.order, c.body = e.head[H_CONTACTS], e.size[N_DYNAMIC], e.order, e.contact_body
+    c.mu, c.normal, c.tangent, c.arm_a, c.arm_b = e.mu, e.normal, e.tangent, e.arm_a, e.arm_b
+    c.inv_mass, c.inv_inertia, c.impulse, c.gap = e.inv_mass, e.inv_inertia, e.impulse, e.gap
+    c.b, c.target, c.d, c.step, c.coupling, c.inv_inertia_arm = e.b, e.target, e.d, e.step, e.coupling, e.inv_inertia_arm
+    c.pair, c.restitution = e.contact_pair, NULL
+    for i in range(e.size[N_BODY]):
+        if e.restitution[i] > 0.0:
+            c.restitution = e.restitution
+    return c
+
+
+cdef inline bint enter_lanes(engine_t* e, const blocks_t* p, packs_t* packs) noexcept nogil:
+    """Return whether groups hold the contacts of the substep; form them if the contacts are new."""
+    cdef contacts_t c
+    cdef int32_t i, sweeps = e.head[H_ITERATIONS]
+    if packs.tried and not e.head[H_REBUILT]:
+        return packs.has_manifolds
+    packs.tried = True
+    packs.has_manifolds = (HAS_MANIFOLDS and packs.lanes > 1 and e.size[N_JOINT] == 0 and p.n_blocks > MAX_POINTS
+                           and e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM)
+    for i in range(p.n_blocks):
+        packs.has_manifolds = packs.has_manifolds and is_disk_friction_contact(p, i)
+    if packs.has_manifolds:
+        set_sweep_order_of_blocks(e)
+        packs.way = get_sweep_direction(e)
+        c = bind_contacts(e)
+        packs.has_manifolds = pack_manifolds(&c, packs.lanes == 4, sweeps if sweeps <= MAX_UNROLLED_SWEEPS else 1, MIN_LANES,
+                                             &packs.manifolds)
+        packs.stored = False
+    if not packs.has_manifolds:
+        for i in range(p.n_blocks):                     # `finish_contacts` builds the rows of kept contacts, too.
+            e.order_scratch[i] = -1
+    return packs.has_manifolds
+
+
+cdef inline void store_lanes(engine_t* e, packs_t* packs, bint rows) noexcept nogil:
+    """Write impulses, gaps, and with `rows` also the rows of the groups to the engine's arrays."""
+    cdef contacts_t c = bind_contacts(e)
+    store_manifolds(&c, &packs.manifolds, rows)
+    packs.stored = packs.stored or rows
+
+
+cdef inline void solve_in_lanes(engine_t* e, packs_t* packs, bint measures) noexcept nogil:
+    """Complete and solve the substep's problem in the groups; with `measures`, write it to the arrays, and measure its errors."""
+    cdef contacts_t c = bind_contacts(e)
+    cdef targets_t t
+    cdef bint wide = packs.lanes == 4
+    t.h, t.beta, t.slop, t.bounce = e.setting[S_H], e.setting[S_BETA], e.setting[S_SLOP], e.setting[S_BOUNCE]
+    t.warm = e.head[H_WARM_START]
+    refresh_manifolds(&c, &packs.manifolds, wide, &t, e.v_free, e.v, e.body_of)
+    if measures:
+        set_sweep_order_of_blocks(e)
+        store_lanes(e, packs, True)
+        store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
+        measure_contact_errors(e, e.setting + S_OUT + 4, e.setting + S_OUT + 6)
+    sweep_manifolds(&packs.manifolds, wide, e.head[H_ITERATIONS], get_sweep_direction(e) != packs.way)
+    store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
+    if measures:
+        store_lanes(e, packs, False)
+        measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
+
+
+cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs) noexcept nogil:
+    """Do what `finish_substep` does after `solve_in_lanes`, with the same bits."""
+    cdef contacts_t c = bind_contacts(e)
+    cdef int finite
+    cdef double depth = check_manifolds(&c, &packs.manifolds, &finite)
+    cdef int32_t shifted = 0, nonfinite_body = -1, any_due = 0
+    store_statistics(e)
+    # projection, integration
+    if not finite or not all_finite(e.setting + S_OUT, 8):
+        store_lanes(e, packs, True)
+        nonfinite_body = find_nonfinite_body(e)
+    if depth > e.setting[S_SLOP] and e.head[H_POSITION_ITERATIONS] > 0:
+        store_lanes(e, packs, not packs.stored)
+        shifted = project_positions(e)
+    else:
+        e.head[H_PROJECTED] = 0
+        e.setting[S_DEPTH] = depth
+        e.setting[S_JOINT_ERROR] = 0.0
+    e.head[H_LOST] = advance_bodies(e, shifted)
+    if e.head[H_LOST] < 0:
+        e.head[H_LOST] = nonfinite_body
+    # gaps and cache for the next substep
+    if e.head[H_PHASE] + 1 < e.head[H_SUBSTEPS]:
+        any_due = find_due_bodies(e, shifted)
+        follow_manifolds(&c, &packs.manifolds, packs.lanes == 4, e.shift)
+        if any_due:
+            store_lanes(e, packs, False)
+            store_contact_cache(e)
+    else:
+        store_lanes(e, packs, False)
+        store_contact_cache(e)
+    if e.head[H_LOST] >= 0:
+        store_lanes(e, packs, not packs.stored)
+    return end_substep(e)
+
+
+cdef inline void solve_packed_substep(engine_t* e, const blocks_t* p, const rows_t* r, packs_t* packs,
+                                      bint measures) noexcept nogil:
+    """Complete and solve the substep's problem as `solve_substep`, with the same bits, over packed blocks if that pays."""
+    finish_contacts(e, p, r)
+    start_solve(e, p, r, measures)
     set_sweep_order_of_blocks(e)
-    if lanes == 0 or not sweep_packed_blocks(e, &p, &r, lanes, packs):
-        sweep_single_blocks(e, &p, &r, NULL, NULL)
+    if packs.lanes == 0 or not sweep_packed_blocks(e, p, r, packs):
+        sweep_single_blocks(e, p, r, NULL, NULL)
     if measures:
         measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
-cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, int32_t lanes, packs_t* packs, int32_t* done) noexcept nogil:
+cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, packs_t* packs, int32_t* done) noexcept nogil:
     """Run up to n substeps as `run_substeps`, with the same bits."""
+    cdef blocks_t p
+    cdef rows_t r
     cdef int32_t status = OK
+    cdef bint last
     done[0] = 0
-    packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
+    packs.tried = packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
     while status == OK and done[0] < n:
-        status = prepare_substep(e)
-        if status == OK:
-            solve_packed_substep(e, lanes, packs, done[0] == n - 1)
+        last = done[0] == n - 1
+        status = prepare_contacts(e, &p, &r)
+        if status != OK:
+            if packs.has_manifolds:
+                store_lanes(e, packs, not packs.stored)
+        elif enter_lanes(e, &p, packs):
+            solve_in_lanes(e, packs, last)
+            status = finish_in_lanes(e, packs)
+            done[0] += 1
+        else:
+            solve_packed_substep(e, &p, &r, packs, last)
             status = finish_substep(e)
             done[0] += 1
     return status
@@ -363,7 +499,6 @@ cdef class Buffers:
     cdef uint64_t[::1] keys
     cdef double[::1] workspace
     cdef packs_t packs
-    cdef public int32_t lanes       # 4 with AVX2, 2 without it; 1: pairs of blocks, 0: single blocks; the bits are the same
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -379,10 +514,19 @@ cdef class Buffers:
         self.workspace = np.empty(2 * length)
         self.packs.workspace[0] = &self.workspace[0]
         self.packs.workspace[1] = &self.workspace[length]
-        self.lanes = 4 if has_avx2() else 2
+        self.packs.lanes = 4 if has_avx2() else 2
 
     def __dealloc__(self):
         free_manifolds(&self.packs.manifolds)
+
+    @property
+    def lanes(self):
+        """4 with AVX2, 2 without it; 1: pairs of blocks, 0: single blocks. The bits are the same."""
+        return self.packs.lanes
+
+    @lanes.setter
+    def lanes(self, int32_t n):
+        self.packs.lanes = n
 
     @property
     def groups(self):
@@ -436,7 +580,7 @@ cdef class Buffers:
         """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = run_packed_substeps(&self.e, n, self.lanes, &self.packs, &done)
+            status = run_packed_substeps(&self.e, n, &self.packs, &done)
         return status, done
 
     def arrays(self):

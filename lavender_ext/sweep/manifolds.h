@@ -1,4 +1,4 @@
-/* Sweeps over contacts, four manifolds at a time, with the bits of a sweep over single contacts; see manifolds.pxd.
+/* Rows and sweeps of contacts, four manifolds at a time, with the bits of single contacts; see manifolds.pxd.
  *
  * A manifold is up to four successive contacts of an order between the same bodies, with one normal, tangent and friction
  * coefficient. Manifolds of a group share no moving body: each is one lane of a vector of four doubles. AVX2 is chosen at run
@@ -12,9 +12,18 @@
 
 typedef struct {                        /* contacts with a normal and two tangents each, in an order; arrays as in rows_t */
     int32_t n, n_bodies;
-    const int32_t *order, *ptr, *body;
-    const double *mu, *b, *step, *normal, *tangent, *arm_a, *arm_b, *inv_mass, *inv_inertia_arm, *coupling;
+    const int32_t *order, *body;
+    const double *mu, *normal, *tangent, *arm_a, *arm_b, *inv_mass, *inv_inertia;
+    const int32_t* pair;                /* (n, 2) bodies that restitution is numbered by */
+    const double* restitution;          /* NULL: none */
+    double *impulse, *gap;              /* (n, 3) N s, (n) m */
+    double *b, *target, *d, *step, *coupling, *inv_inertia_arm;     /* rows that `lavender_store_manifolds` writes */
 } lavender_contacts;
+
+typedef struct {                        /* what the right-hand sides depend on, see engine/contacts.pxd */
+    double h, beta, slop, bounce;
+    int warm;
+} lavender_targets;
 
 #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
 #define LAVENDER_HAS_MANIFOLDS 1
@@ -26,45 +35,54 @@ typedef long long lavender_four_bits __attribute__((vector_size(32), may_alias))
 #define LAVENDER_DOT_FOUR(x, y) ((x)[0] * (y)[0] + (x)[1] * (y)[1] + (x)[2] * (y)[2])
 
 typedef struct {
-    lavender_four arm_a[3], arm_b[3], step[2], coupling[2], inv_inertia_arm[18];
+    lavender_four arm_a[3], arm_b[3];
 } lavender_point;
+
+typedef struct {                        /* apart from the points, because only sweeps read them */
+    lavender_four step[2], coupling[2], inv_inertia_arm[18];
+} lavender_rows;
 
 typedef struct {
     int32_t read_a[4], read_b[4], write_a[4], write_b[4];   /* offsets of the velocities of each lane's bodies */
     int32_t contact[4][4];              /* offset of the impulses of point and lane */
     int32_t count[4];                   /* points of each lane, 0 of an empty one */
-    int32_t n, n_all, unused[2];        /* points of the longest and of the shortest lane */
-    lavender_four normal[3], tangent1[3], tangent2[3], inv_mass_a, inv_mass_b, mu;
+    int32_t n, n_all;                   /* points of the longest and of the shortest lane */
+    int32_t first_row, unused;          /* rows of its first point */
+    lavender_four axis[9], inv_mass_a, inv_mass_b, mu, bounce;  /* axis: normal, both tangents */
     lavender_point point[];             /* (n) */
 } lavender_group;
 
 typedef struct {
-    int32_t n_groups, n_sweeps;         /* sweeps that one pass over the groups makes */
-    size_t* start;                      /* (n_groups) bytes */
+    int32_t n_groups, n_sweeps;         /* groups of a sweep; sweeps that one pass over them makes */
+    int32_t n_once;                     /* groups with each manifold once: the same groups if n_sweeps is 1 */
+    int32_t along;                      /* 1: they have the contacts as numbered, -1: backwards, 0: neither */
+    size_t *start, *start_once;         /* bytes */
     char* groups;
-    double *x, *v;                      /* (contacts + 1, 8) impulses and -b; (bodies + 2, 8) velocities */
-    int32_t* scratch;
-    size_t sizes[5];                    /* allocated bytes: start, groups, x, v, scratch */
+    lavender_rows* rows;
+    double *x, *v, *free, *before;      /* (contacts + 1, 8) as `relax` tells; (bodies + 2, 8) velocities */
+    double *d, *inverse;                /* (contacts + 1, 2) 1/kg; (bodies + 1, 12) inverse inertia */
+    void* place[9];                     /* allocated memory, and its sizes in bytes */
+    size_t size[9];
 } lavender_manifolds;
 
-/* Make room for `size` bytes at a multiple of 64; the content is lost. Return 0 without memory. */
-static int lavender_reserve(void** place, size_t* allocated, size_t size) {
-    if (size <= *allocated) return 1;
-    free(*place);
-    *allocated = 0;
-    *place = NULL;
+enum { LAVENDER_SWEEP, LAVENDER_ROWS, LAVENDER_REFRESH, LAVENDER_FOLLOW };
+#define LAVENDER_HAS_POINT(g, k) \
+    (lavender_four_bits) { -(g->count[0] > k), -(g->count[1] > k), -(g->count[2] > k), -(g->count[3] > k) }
+
+/* Return memory number k of `size` bytes at a multiple of 64, or NULL; it keeps its content only while it is large enough. */
+static void* lavender_reserve(lavender_manifolds* m, int k, size_t size) {
+    if (size <= m->size[k]) return m->place[k];
+    free(m->place[k]);
+    m->place[k] = NULL;
+    m->size[k] = 0;
     size += size / 2;
-    if (posix_memalign(place, 64, size)) return 0;
-    *allocated = size;
-    return 1;
+    if (posix_memalign(&m->place[k], 64, size)) return m->place[k] = NULL;
+    m->size[k] = size;
+    return m->place[k];
 }
 
 static void lavender_free_manifolds(lavender_manifolds* m) {
-    free(m->start);
-    free(m->groups);
-    free(m->x);
-    free(m->v);
-    free(m->scratch);
+    for (int k = 0; k < 9; k++) free(m->place[k]);
     memset(m, 0, sizeof *m);
 }
 
@@ -124,209 +142,349 @@ static void lavender_free_manifolds(lavender_manifolds* m) {
 #define ROOT(x) ((lavender_four)_mm256_sqrt_pd((__m256d)(x)))
 #define ANY(mask) (_mm256_movemask_pd((__m256d)(mask)) != 0)
 #include "manifolds_body.h"
-#define lavender_sweep_groups(wide, ...) ((wide) ? lavender_sweep_avx2(__VA_ARGS__) : lavender_sweep_plain(__VA_ARGS__))
+#define lavender_run_groups(wide, ...) ((wide) ? lavender_run_avx2(__VA_ARGS__) : lavender_run_plain(__VA_ARGS__))
 static int lavender_has_avx2(void) { return __builtin_cpu_supports("avx2") != 0; }
 #else
-#define lavender_sweep_groups(wide, ...) lavender_sweep_plain(__VA_ARGS__)
+#define lavender_run_groups(wide, ...) lavender_run_plain(__VA_ARGS__)
 static int lavender_has_avx2(void) { return 0; }
 #endif
 
-/* Write manifold `first` .. `first` + `count` of the order to a lane of a group. */
+/* Write manifold `first` .. `first` + `count` of the order to a lane of a group, without its rows. */
 static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_t count, lavender_group* g, int lane) {
     const int32_t i = c->order[first], *body = c->body + 2 * i;
     const double *n = c->normal + 3 * i, *t = c->tangent + 3 * i;
+    double* axis = (double*)g->axis + lane;
     g->read_a[lane] = 8 * (body[0] >= 0 ? body[0] : c->n_bodies);
     g->read_b[lane] = 8 * (body[1] >= 0 ? body[1] : c->n_bodies);
     g->write_a[lane] = 8 * (body[0] >= 0 ? body[0] : c->n_bodies + 1);
     g->write_b[lane] = 8 * (body[1] >= 0 ? body[1] : c->n_bodies + 1);
     g->count[lane] = count;
     for (int k = 0; k < 3; k++) {
-        g->normal[k][lane] = n[k];
-        g->tangent1[k][lane] = t[k];
+        axis[4 * k] = n[k];
+        axis[4 * (3 + k)] = t[k];
     }
-    g->tangent2[0][lane] = n[1] * t[2] - n[2] * t[1];
-    g->tangent2[1][lane] = n[2] * t[0] - n[0] * t[2];
-    g->tangent2[2][lane] = n[0] * t[1] - n[1] * t[0];
-    g->inv_mass_a[lane] = body[0] >= 0 ? c->inv_mass[body[0]] : 0.0;
-    g->inv_mass_b[lane] = body[1] >= 0 ? c->inv_mass[body[1]] : 0.0;
-    g->mu[lane] = c->mu[i];
+    axis[4 * 6] = n[1] * t[2] - n[2] * t[1];
+    axis[4 * 7] = n[2] * t[0] - n[0] * t[2];
+    axis[4 * 8] = n[0] * t[1] - n[1] * t[0];
+    axis[4 * 9] = body[0] >= 0 ? c->inv_mass[body[0]] : 0.0;
+    axis[4 * 10] = body[1] >= 0 ? c->inv_mass[body[1]] : 0.0;
+    axis[4 * 11] = c->mu[i];
+    axis[4 * 12] = 0.0;
+    if (c->restitution) {
+        const double x = c->restitution[c->pair[2 * i]], y = c->restitution[c->pair[2 * i + 1]];
+        axis[4 * 12] = x > y ? x : y;
+    }
     for (int j = 0; j < count; j++) {
-        const int32_t at = c->order[first + j], row = c->ptr[at];
+        const int32_t at = c->order[first + j];
         double* p = (double*)(g->point + j) + lane;
-        const double *ra = c->arm_a + 3 * at, *rb = c->arm_b + 3 * at, *k = c->inv_inertia_arm + 6 * (row - c->ptr[0]);
         g->contact[j][lane] = 8 * at;
         for (int q = 0; q < 3; q++) {
-            p[4 * q] = ra[q];
-            p[4 * (3 + q)] = rb[q];
+            p[4 * q] = c->arm_a[3 * at + q];
+            p[4 * (3 + q)] = c->arm_b[3 * at + q];
         }
-        p[4 * 6] = c->step[row];
-        p[4 * 7] = c->step[row + 1];
-        p[4 * 8] = c->coupling[5 * at];
-        p[4 * 9] = c->coupling[5 * at + 1];
-        for (int q = 0; q < 18; q++) p[4 * (10 + q)] = k[q];
     }
 }
 
-/* Let a lane be empty: it reads zeros, and nothing reads what it writes. */
-static void lavender_empty_lane(const lavender_contacts* c, lavender_group* g, int lane) {
-    double* x = (double*)g->normal + lane;
-    g->read_a[lane] = g->read_b[lane] = 8 * c->n_bodies;
-    g->write_a[lane] = g->write_b[lane] = 8 * (c->n_bodies + 1);
-    g->count[lane] = 0;
-    for (int k = 0; k < 12; k++) x[4 * k] = 0.0;
+/* Copy a lane of a group to a lane of another one. */
+static void lavender_copy_lane(const lavender_group* from, int i, lavender_group* to, int k) {
+    const int count = from->count[i];
+    to->read_a[k] = from->read_a[i];
+    to->read_b[k] = from->read_b[i];
+    to->write_a[k] = from->write_a[i];
+    to->write_b[k] = from->write_b[i];
+    to->count[k] = count;
+    for (int j = 0; j < count; j++) to->contact[j][k] = from->contact[j][i];
+    const double* x = (const double*)from->axis + i;
+    double* y = (double*)to->axis + k;
+    for (size_t q = 0; q < 13 + 6 * (size_t)count; q++) y[4 * q] = x[4 * q];
 }
 
-/* Form manifolds and their levels; `first` (n + 1), `level` (n), `next` and `begin` (n_bodies). Return the number of manifolds.
- *
- * The level of a manifold is one above those of all earlier manifolds of its moving bodies. period: largest number of levels
- * between the first and the last manifold of a body, both included. */
-static int32_t lavender_find_manifolds(const lavender_contacts* c, int32_t* first, int32_t* level, int32_t* next, int32_t* begin,
-                                       int32_t* levels, int32_t* period) {
+/* Copy the rows of a lane to a lane of another group. */
+static void lavender_copy_rows(const lavender_rows* from, int i, lavender_rows* to, int k, int count) {
+    const double* x = (const double*)from + i;
+    double* y = (double*)to + k;
+    for (size_t q = 0; q < 22 * (size_t)count; q++) y[4 * q] = x[4 * q];
+}
+
+/* Open a group: all lanes are empty. An empty lane reads zeros, and nothing reads what it writes. */
+static lavender_group* lavender_open_group(const lavender_contacts* c, char* place, int32_t first_row) {
+    lavender_group* g = (lavender_group*)place;
+    memset(g, 0, sizeof *g);
+    g->first_row = first_row;
+    for (int lane = 0; lane < 4; lane++) {
+        g->read_a[lane] = g->read_b[lane] = 8 * c->n_bodies;
+        g->write_a[lane] = g->write_b[lane] = 8 * (c->n_bodies + 1);
+    }
+    g->n_all = 4;
+    return g;
+}
+
+/* Close a group, and return its size in bytes. Points that a lane does not have are zero and belong to contact n. */
+static size_t lavender_close_group(const lavender_contacts* c, lavender_group* g, lavender_rows* rows) {
+    for (int lane = 0; lane < 4; lane++) {
+        if (g->count[lane] > g->n) g->n = g->count[lane];
+        if (g->count[lane] && g->count[lane] < g->n_all) g->n_all = g->count[lane];
+    }
+    for (int lane = 0; lane < 4; lane++)
+        for (int j = g->count[lane]; j < g->n; j++) {
+            double* p = (double*)(g->point + j) + lane;
+            for (int q = 0; q < 6; q++) p[4 * q] = 0.0;
+            for (int q = 0; q < 22; q++) ((double*)(rows + j))[4 * q + lane] = 0.0;
+            g->contact[j][lane] = 8 * c->n;
+        }
+    return sizeof *g + (size_t)g->n * sizeof *g->point;
+}
+
+/* Form manifolds, and write the place of the first contact of each to `first` (n + 1); return their number. */
+static int32_t lavender_find_manifolds(const lavender_contacts* c, int32_t* first) {
     int32_t m = 0, before = -1;
-    *levels = 0;
-    *period = 1;
-    for (int32_t i = 0; i < c->n_bodies; i++) next[i] = 0, begin[i] = -1;
     for (int32_t k = 0; k < c->n; k++) {
         const int32_t i = c->order[k], *body = c->body + 2 * i;
-        if (before >= 0 && k - first[m - 1] < 4 && body[0] == c->body[2 * before] && body[1] == c->body[2 * before + 1]
-            && !memcmp(c->normal + 3 * i, c->normal + 3 * before, 24) && !memcmp(c->tangent + 3 * i, c->tangent + 3 * before, 24)
-            && c->mu[i] == c->mu[before]) {
-            before = i;
-            continue;
-        }
-        int32_t top = 0;
-        for (int side = 0; side < 2; side++)
-            if (body[side] >= 0 && next[body[side]] > top) top = next[body[side]];
-        for (int side = 0; side < 2; side++)
-            if (body[side] >= 0) {
-                next[body[side]] = top + 1;
-                if (begin[body[side]] < 0) begin[body[side]] = top;
-                if (top + 1 - begin[body[side]] > *period) *period = top + 1 - begin[body[side]];
-            }
-        first[m] = k;
-        level[m++] = top;
-        if (top >= *levels) *levels = top + 1;
+        if (!(before >= 0 && k - first[m - 1] < 4 && body[0] == c->body[2 * before] && body[1] == c->body[2 * before + 1]
+              && !memcmp(c->normal + 3 * i, c->normal + 3 * before, 24)
+              && !memcmp(c->tangent + 3 * i, c->tangent + 3 * before, 24) && c->mu[i] == c->mu[before])) first[m++] = k;
         before = i;
     }
     first[m] = c->n;
     return m;
 }
 
-/* Pack the contacts of an order into groups whose passes make n_sweeps sweeps each, or one sweep. Return 0 if the groups would
- * have fewer than `least` manifolds on average, or without memory.
+/* Find a group for each of `count` manifolds in `sweeps` sweeps: the first with an empty lane after the groups of all earlier
+ * updates of its bodies, or one soon after that in which all lanes have as many points. Return the number of groups.
  *
- * Manifolds of equal level share no moving body. If they fill few lanes, one pass makes all sweeps: manifold k in sweep s waits
- * until level(k) + s period, and shares no body with the others of that time. */
-static int lavender_pack_manifolds(const lavender_contacts* c, int32_t n_sweeps, double least, lavender_manifolds* m) {
-    const size_t n = (size_t)c->n, n_bodies = (size_t)c->n_bodies;
-    int32_t levels, period, groups = 0, unrolled = 0, time = 0;
-    size_t bytes = 0;
-    if (!lavender_reserve((void**)&m->scratch, &m->sizes[4], 4 * (3 * n + 2 + 2 * n_bodies))) return 0;
-    int32_t *first = m->scratch, *level = first + n + 1, *by_level = level + n, *next = by_level + n, *begin = next + n_bodies;
-    const int32_t count = lavender_find_manifolds(c, first, level, next, begin, &levels, &period);
-    /* size of each level, and of each time; by_level: manifolds by level, those with most points first */
-    const int32_t times = levels + (n_sweeps - 1) * period;
-    if (!lavender_reserve((void**)&m->start, &m->sizes[0], sizeof(size_t) * ((size_t)count * (size_t)n_sweeps + 1)
-                          + 4 * ((size_t)times + 6 * (size_t)levels + 6))) return 0;
-    int32_t *end = (int32_t*)(m->start + (size_t)count * (size_t)n_sweeps + 1), *size = end + 5 * levels + 1;
-    memset(end, 0, 4 * (5 * (size_t)levels + 1));
-    memset(size, 0, 4 * (size_t)times);
-    for (int32_t k = 0; k < count; k++) end[4 * level[k] + 4 - (first[k + 1] - first[k]) + 1]++;
-    for (int32_t k = 1; k <= 4 * levels; k++) end[k] += end[k - 1];
-    for (int32_t k = 0; k < levels; k++) {
-        const int32_t of_level = end[4 * k + 4] - end[4 * k];
-        groups += (of_level + 3) / 4;
-        for (int32_t s = 0; s < n_sweeps; s++) size[k + s * period] += of_level;
-    }
-    for (int32_t k = 0; k < times; k++) unrolled += (size[k] + 3) / 4;
-    m->n_sweeps = 5 * unrolled < 4 * n_sweeps * groups ? n_sweeps : 1;
-    m->n_groups = m->n_sweeps > 1 ? unrolled : groups;
-    if (m->n_groups == 0 || (double)count * m->n_sweeps < least * m->n_groups) return 0;
-    int32_t* place = size + times;      /* (levels) first manifold of each level */
-    for (int32_t k = 0; k < levels; k++) place[k] = end[4 * k];
-    for (int32_t k = 0; k < count; k++) by_level[end[4 * level[k] + 4 - (first[k + 1] - first[k])]++] = k;
-    /* Now end[4 k + 3] is the end of level k. */
-    if (!lavender_reserve((void**)&m->x, &m->sizes[2], 64 * (n + 1)) || !lavender_reserve((void**)&m->v, &m->sizes[3], 64 * (n_bodies + 2)))
-        return 0;
-    const size_t most = sizeof(lavender_group) + 4 * sizeof(lavender_point);
-    if (!lavender_reserve((void**)&m->groups, &m->sizes[1], most * (size_t)m->n_groups)) return 0;
-    groups = 0;
-    for (time = 0; time < (m->n_sweeps > 1 ? times : levels); time++) {
-        lavender_group* g = NULL;
-        int lane = 4;
-        for (int32_t s = 0; s < m->n_sweeps && s * period <= time; s++) {
-            const int32_t at = time - s * period;
-            if (at >= levels) continue;
-            for (int32_t k = place[at]; k < end[4 * at + 3]; k++) {
-                const int32_t f = first[by_level[k]], points = first[by_level[k] + 1] - f;
-                if (lane == 4) {
-                    if (g) bytes += sizeof *g + (size_t)g->n * sizeof *g->point;
-                    m->start[groups++] = bytes;
-                    g = (lavender_group*)(m->groups + bytes);
-                    g->n = 0;
-                    g->n_all = 4;
-                    lane = 0;
-                }
-                lavender_fill_lane(c, f, points, g, lane++);
-                if (points > g->n) g->n = points;
-                if (points < g->n_all) g->n_all = points;
+ * group, open, used, points (count sweeps); last (n_bodies) */
+static int32_t lavender_schedule(const lavender_contacts* c, const int32_t* first, int32_t count, int32_t sweeps, int32_t* group,
+                                 int32_t* open, int32_t* used, int32_t* points, int32_t* last) {
+    int32_t n = 0;
+    for (int32_t i = 0; i < c->n_bodies; i++) last[i] = -1;
+    for (int32_t item = 0; item < count * sweeps; item++) {
+        const int32_t k = item % count, *body = c->body + 2 * c->order[first[k]], size = first[k + 1] - first[k];
+        int32_t g = -1, best = -1;
+        for (int side = 0; side < 2; side++)
+            if (body[side] >= 0 && last[body[side]] > g) g = last[body[side]];
+        g++;
+        for (int tries = 0; tries < 6; tries++, g++) {
+            while (g < n && open[g] != g) g = open[g] = open[g] < n ? open[open[g]] : open[g];
+            if (best < 0) best = g;
+            if (g >= n) break;
+            if (points[g] == size) {
+                best = g;
+                break;
             }
         }
-        if (!g) continue;
-        /* Close the last group of this time, in which lanes may be empty. */
-        bytes += sizeof *g + (size_t)g->n * sizeof *g->point;
-        for (; lane < 4; lane++) lavender_empty_lane(c, g, lane), g->n_all = 0;
+        g = best;
+        if (g >= n) {
+            used[n] = 0;
+            points[n] = size;
+            open[n] = n;
+            g = n++;
+        }
+        group[item] = g;
+        if (++used[g] == 4) open[g] = g + 1;
+        for (int side = 0; side < 2; side++)
+            if (body[side] >= 0) last[body[side]] = g;
     }
-    /* Points that a lane does not have. */
-    for (int32_t k = 0; k < m->n_groups; k++) {
-        lavender_group* g = (lavender_group*)(m->groups + m->start[k]);
-        for (int j = g->n_all; j < g->n; j++)
-            for (int lane = 0; lane < 4; lane++)
-                if (g->count[lane] <= j) {
-                    double* p = (double*)(g->point + j) + lane;
-                    for (int q = 0; q < 28; q++) p[4 * q] = 0.0;
-                    g->contact[j][lane] = 8 * c->n;
-                }
+    return n;
+}
+
+/* Pack the contacts of an order into groups whose passes make n_sweeps sweeps each, or one sweep; compute their rows, and load
+ * impulses and gaps. Return 0 if a sweep would have fewer than `least` manifolds in a group on average, or without memory. */
+static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t n_sweeps, double least, lavender_manifolds* m) {
+    const size_t n = (size_t)c->n, n_bodies = (size_t)c->n_bodies, most = sizeof(lavender_group) + 4 * sizeof(lavender_point);
+    size_t bytes = 0;
+    int32_t* first = (int32_t*)lavender_reserve(m, 0, 4 * (n + 1 + n_bodies));
+    if (!first) return 0;
+    int32_t* last = first + n + 1;
+    const int32_t count = lavender_find_manifolds(c, first);
+    /* the group of each manifold; if one sweep fills few lanes, groups of several sweeps */
+    int32_t* group = (int32_t*)lavender_reserve(m, 1, 4 * 5 * (size_t)count * (size_t)n_sweeps);
+    if (!group) return 0;
+    int32_t *open = group + count * n_sweeps, *used = open + count * n_sweeps, *points = used + count * n_sweeps;
+    int32_t *sorted = points + count * n_sweeps, more = 0;
+    m->n_sweeps = 1;
+    m->n_groups = m->n_once = lavender_schedule(c, first, count, 1, group, open, used, points, last);
+    if (n_sweeps > 1 && 2 * count < 7 * m->n_groups) {
+        more = lavender_schedule(c, first, count, n_sweeps, group, open, used, points, last);
+        if (5 * more < 4 * n_sweeps * m->n_groups) {
+            m->n_sweeps = n_sweeps;
+            m->n_groups = more;
+            m->n_once = (count + 3) / 4;
+        } else lavender_schedule(c, first, count, 1, group, open, used, points, last);
+    }
+    if (m->n_groups == 0 || (double)count * m->n_sweeps < least * m->n_groups) return 0;
+    m->along = c->order[0] == 0 ? 1 : -1;
+    for (int32_t k = 0; k < c->n && m->along; k++)
+        if (c->order[k] != (m->along > 0 ? k : c->n - 1 - k)) m->along = 0;
+    /* memory */
+    const size_t every = (size_t)m->n_groups + (m->n_sweeps > 1 ? (size_t)m->n_once : 0);
+    m->start = (size_t*)lavender_reserve(m, 2, sizeof(size_t) * every);
+    m->groups = (char*)lavender_reserve(m, 3, most * every);
+    m->x = (double*)lavender_reserve(m, 4, 8 * 8 * (n + 1));
+    m->v = (double*)lavender_reserve(m, 5, 3 * 8 * 8 * (n_bodies + 2));
+    m->d = (double*)lavender_reserve(m, 6, 8 * 2 * (n + 1));
+    m->inverse = (double*)lavender_reserve(m, 7, 8 * 12 * (n_bodies + 1));
+    m->rows = (lavender_rows*)lavender_reserve(m, 8, 4 * every * sizeof(lavender_rows));
+    if (!(m->start && m->groups && m->x && m->v && m->d && m->inverse && m->rows)) return 0;
+    m->start_once = m->n_sweeps > 1 ? m->start + m->n_groups : m->start;
+    m->free = m->v + 8 * (n_bodies + 2);
+    m->before = m->free + 8 * (n_bodies + 2);
+    memset(m->v, 0, 3 * 8 * 8 * (n_bodies + 2));
+    for (size_t i = 0; i < n_bodies; i++) {
+        for (int k = 0; k < 9; k++) m->inverse[12 * i + (size_t)k] = c->inv_inertia[9 * i + (size_t)k];
+        m->inverse[12 * i + 9] = m->inverse[12 * i + 10] = m->inverse[12 * i + 11] = 0.0;
+    }
+    memset(m->inverse + 12 * n_bodies, 0, 8 * 12);
+    memset(m->x + 8 * n, 0, 8 * 8);
+    for (size_t i = 0; i < n; i++) {
+        for (int k = 0; k < 3; k++) m->x[8 * i + (size_t)k] = c->impulse[3 * i + (size_t)k];
+        m->x[8 * i + 3] = c->gap[i];
+    }
+    /* Sort the updates by group: `used` becomes the end of each group. */
+    for (int32_t k = 0, sum = 0; k < m->n_groups; k++) {
+        sum += used[k];
+        used[k] = sum - used[k];
+    }
+    for (int32_t item = 0; item < count * m->n_sweeps; item++) sorted[used[group[item]]++] = item % count;
+    /* groups with every manifold once, by these groups or one after the other */
+    int32_t row = 0;
+    for (int32_t k = 0, i = 0; k < m->n_once; k++) {
+        lavender_group* g = lavender_open_group(c, m->groups + bytes, row);
+        const int32_t stop = m->n_sweeps == 1 ? used[k] : (i + 4 < count ? i + 4 : count);
+        for (int lane = 0; i < stop; lane++, i++) {
+            const int32_t at = m->n_sweeps == 1 ? sorted[i] : i;
+            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, lane);
+        }
+        m->start_once[k] = bytes;
+        bytes += lavender_close_group(c, g, m->rows + row);
+        row += g->n;
+    }
+    lavender_run_groups(wide, m, LAVENDER_ROWS, 0, NULL, NULL, NULL);
+    /* groups of several sweeps */
+    for (int32_t k = 0, i = 0; k < m->n_groups && m->n_sweeps > 1; k++) {
+        lavender_group* g = lavender_open_group(c, m->groups + bytes, row);
+        for (int lane = 0; i < used[k]; lane++, i++) {
+            const lavender_group* from = (const lavender_group*)(m->groups + m->start_once[sorted[i] / 4]);
+            lavender_copy_lane(from, sorted[i] % 4, g, lane);
+            lavender_copy_rows(m->rows + from->first_row, sorted[i] % 4, m->rows + row, lane, g->count[lane]);
+        }
+        m->start[k] = bytes;
+        bytes += lavender_close_group(c, g, m->rows + row);
+        row += g->n;
     }
     return 1;
 }
 
-/* Run sweeps over packed contacts; b and lam (rows), v (n_bodies, 6). */
-static void lavender_sweep_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, int32_t sweeps, int backwards,
-                                     double* lam, double* v) {
-    double *x = m->x, *w = m->v;
-    for (int32_t k = 0; k < c->n; k++) {
-        const int32_t i = c->order[k];
-        const double *from = lam + c->ptr[i], *b = c->b + c->ptr[i];
-        double* to = x + 8 * (size_t)i;
-        for (int q = 0; q < 3; q++) {
-            to[q] = from[q];
-            to[4 + q] = 0.0 - b[q];
+static void lavender_load_velocities(int32_t n, const double* from, double* to) {
+    for (size_t i = 0; i < (size_t)n; i++)
+        for (int k = 0; k < 6; k++) to[8 * i + (size_t)k] = from[6 * i + (size_t)k];
+}
+
+static void lavender_store_velocities(int32_t n, const double* from, double* to) {
+    for (size_t i = 0; i < (size_t)n; i++)
+        for (int k = 0; k < 6; k++) to[6 * i + (size_t)k] = from[8 * i + (size_t)k];
+}
+
+/* Compute the right-hand sides for the velocities `free` (n_bodies, 6) and those before the substep of all bodies, `before`, and
+ * the velocities M^-1 J^T lam of the warm start: `compute_velocity_change` of core/velocity.pxd. */
+static void lavender_refresh_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, const lavender_targets* t,
+                                       const double* free, const double* before, const int32_t* body_of) {
+    const int in_lanes = m->along && m->n_sweeps == 1;
+    double *v = m->v, l[3];
+    lavender_load_velocities(c->n_bodies, free, m->free);
+    for (int32_t i = 0; c->restitution && i < c->n_bodies; i++)
+        for (int k = 0; k < 6; k++) m->before[8 * i + k] = before[6 * body_of[i] + k];
+    memset(v, 0, 64 * (size_t)(c->n_bodies + 2));
+    lavender_run_groups(wide, m, LAVENDER_REFRESH, m->along < 0, t, c->restitution ? m->before : NULL,
+                        t->warm && in_lanes ? v : NULL);
+    for (int32_t i = 0; i < c->n && t->warm && !in_lanes; i++) {
+        const double *n = c->normal + 3 * i, *s = c->tangent + 3 * i, *x = m->x + 8 * (size_t)i;
+        const double u[3] = {n[1] * s[2] - n[2] * s[1], n[2] * s[0] - n[0] * s[2], n[0] * s[1] - n[1] * s[0]};
+        double f[3];
+        for (int k = 0; k < 3; k++) f[k] = (x[0] * n[k] + x[1] * s[k]) + x[2] * u[k];
+        for (int side = 0; side < 2; side++) {
+            const int32_t body = c->body[2 * i + side];
+            const double* r = (side ? c->arm_b : c->arm_a) + 3 * i;
+            double* to = v + 8 * (size_t)(body >= 0 ? body : c->n_bodies + 1);
+            l[0] = r[1] * f[2] - r[2] * f[1];
+            l[1] = r[2] * f[0] - r[0] * f[2];
+            l[2] = r[0] * f[1] - r[1] * f[0];
+            for (int k = 0; k < 3; k++) {
+                to[k] = side ? to[k] + f[k] : to[k] - f[k];
+                to[3 + k] = side ? to[3 + k] + l[k] : to[3 + k] - l[k];
+            }
         }
-        to[3] = to[7] = 0.0;
     }
-    memset(x + 8 * (size_t)c->n, 0, 64);
-    for (int32_t i = 0; i < c->n_bodies; i++) {
-        for (int q = 0; q < 6; q++) w[8 * (size_t)i + q] = v[6 * (size_t)i + q];
-        w[8 * (size_t)i + 6] = w[8 * (size_t)i + 7] = 0.0;
+    for (int32_t i = 0; i < c->n_bodies; i++, v += 8) {
+        const double* inv = c->inv_inertia + 9 * i;
+        for (int k = 0; k < 3; k++) {
+            v[k] *= c->inv_mass[i];
+            l[k] = v[3 + k];
+        }
+        for (int k = 0; k < 3; k++) v[3 + k] = inv[3 * k] * l[0] + inv[3 * k + 1] * l[1] + inv[3 * k + 2] * l[2];
     }
-    memset(w + 8 * (size_t)c->n_bodies, 0, 128);
-    for (int32_t s = 0; s < sweeps; s += m->n_sweeps) lavender_sweep_groups(wide, m, backwards, x, w);
-    for (int32_t k = 0; k < c->n; k++) {
-        const int32_t i = c->order[k];
-        for (int q = 0; q < 3; q++) lam[c->ptr[i] + q] = x[8 * (size_t)i + q];
+}
+
+static void lavender_sweep_manifolds(lavender_manifolds* m, int wide, int32_t sweeps, int backwards) {
+    for (int32_t s = 0; s < sweeps; s += m->n_sweeps) lavender_run_groups(wide, m, LAVENDER_SWEEP, backwards, NULL, NULL, NULL);
+}
+
+/* Let the gaps follow the displacement s (n_bodies, 6) of the bodies. */
+static void lavender_follow_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, const double* s) {
+    lavender_load_velocities(c->n_bodies, s, m->free);
+    lavender_run_groups(wide, m, LAVENDER_FOLLOW, 0, NULL, NULL, NULL);
+}
+
+/* Return the largest -gap [m], at least 0; finite: whether all gaps and impulses are finite. */
+static double lavender_check_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int* finite) {
+    double depth = 0.0, bad[4] = {0.0, 0.0, 0.0, 0.0};
+    for (size_t i = 0; i < (size_t)c->n; i++) {
+        const double* x = m->x + 8 * i;
+        for (int k = 0; k < 4; k++) bad[k] += 0.0 * x[k];
+        if (-x[3] > depth) depth = -x[3];
     }
-    for (int32_t i = 0; i < c->n_bodies; i++)
-        for (int q = 0; q < 6; q++) v[6 * (size_t)i + q] = w[8 * (size_t)i + q];
+    *finite = (bad[0] + bad[1]) + (bad[2] + bad[3]) == 0.0;
+    return depth;
+}
+
+/* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them. */
+static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows) {
+    for (size_t i = 0; i < (size_t)c->n; i++) {
+        const double* x = m->x + 8 * i;
+        for (size_t k = 0; k < 3; k++) c->impulse[3 * i + k] = x[k];
+        c->gap[i] = x[3];
+        for (size_t k = 0; k < 3 && rows; k++) {
+            c->b[3 * i + k] = 0.0 - x[4 + k];
+            c->target[3 * i + k] = k ? 0.0 : x[7];
+            c->d[3 * i + k] = m->d[2 * i + (k > 0)];
+        }
+    }
+    for (int32_t k = 0; k < m->n_once && rows; k++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[k]);
+        for (int lane = 0; lane < 4; lane++)
+            for (int j = 0; j < g->count[lane]; j++) {
+                const size_t i = (size_t)g->contact[j][lane] / 8;
+                const double* p = (const double*)(m->rows + g->first_row + j) + lane;
+                c->step[3 * i] = p[4 * 0];
+                c->step[3 * i + 1] = c->step[3 * i + 2] = p[4 * 1];
+                for (size_t q = 0; q < 5; q++) c->coupling[5 * i + q] = q < 2 ? p[4 * (2 + q)] : 0.0;
+                for (size_t q = 0; q < 18; q++)
+                    c->inv_inertia_arm[18 * i + q] = c->body[2 * i + q / 3 % 2] >= 0 ? p[4 * (4 + q)] : 0.0;
+            }
+    }
 }
 #else
 typedef struct {
     int32_t n_groups;
 } lavender_manifolds;
 #define LAVENDER_HAS_MANIFOLDS 0
-#define lavender_free_manifolds(m) ((void)(m))
 #define lavender_has_avx2() 0
-#define lavender_pack_manifolds(c, n_sweeps, least, m) ((void)(c), (void)(n_sweeps), 0)
-#define lavender_sweep_manifolds(c, m, wide, sweeps, backwards, lam, v) ((void)(c), (void)(sweeps), (void)(backwards))
+#define lavender_free_manifolds(m) ((void)(m))
+#define lavender_pack_manifolds(c, wide, n_sweeps, least, m) ((void)(c), (void)(wide), (void)(n_sweeps), 0)
+#define lavender_refresh_manifolds(c, m, wide, t, free, before, body_of) ((void)(c), (void)(t))
+#define lavender_sweep_manifolds(m, wide, sweeps, backwards) ((void)(wide), (void)(sweeps), (void)(backwards))
+#define lavender_follow_manifolds(c, m, wide, s) ((void)(c))
+#define lavender_check_manifolds(c, m, finite) ((void)(c), *(finite) = 1, 0.0)
+#define lavender_store_manifolds(c, m, rows) ((void)(c), (void)(rows))
+#define lavender_store_velocities(n, from, to) ((void)(n))
 #endif
 #endif

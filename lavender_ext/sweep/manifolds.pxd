@@ -1,16 +1,13 @@
-"""Sweeps over contacts in groups of four manifolds, one in each lane of a vector, with the bits of single contacts (manifolds.h).
+"""Rows and sweeps of contacts in groups of four manifolds, one in each lane of a vector, with the bits of single contacts.
 
-A manifold waits for the earlier manifolds of its bodies only. Manifolds of equal level, as in `packed.pyx`, share no moving body
-and may be updated at once; every body still sees the same sequence of updates. Where levels fill few lanes, as in a tower, the
-groups also hold the manifolds of later sweeps, (1) of `packed.pyx`. The groups read backwards are a sweep of the reversed order.
+A manifold waits for the earlier manifolds of its bodies only. It enters the first group after theirs that has an empty lane, so
+that the manifolds of a group share no moving body and every body sees the same sequence of updates. Where one sweep fills few
+lanes, as in a tower, groups also hold the manifolds of later sweeps. The groups read backwards are a sweep of the reversed order.
 
-Only contacts with two tangents in a disk and without compliance enter lanes. Impulses and right-hand sides remain outside of the
-groups, so that a later call with the same rows needs no packing.
+Only contacts with two tangents in a disk and without compliance enter lanes. The groups hold their rows, and beside the groups
+lie impulses, gaps and right-hand sides, so that a substep with the same contacts needs no packing (manifolds.h).
 """
 from libc.stdint cimport int32_t
-
-from lavender_ext.core.block_types cimport blocks_t, is_disk_friction_contact
-from lavender_ext.core.view cimport rows_t
 
 
 cdef extern from "lavender_ext/sweep/manifolds.h":
@@ -18,49 +15,44 @@ cdef extern from "lavender_ext/sweep/manifolds.h":
         int32_t n
         int32_t n_bodies
         const int32_t* order
-        const int32_t* ptr
         const int32_t* body
         const double* mu
-        const double* b
-        const double* step
         const double* normal
         const double* tangent
         const double* arm_a
         const double* arm_b
         const double* inv_mass
-        const double* inv_inertia_arm
-        const double* coupling
+        const double* inv_inertia
+        const int32_t* pair
+        const double* restitution
+        double* impulse
+        double* gap
+        double* b
+        double* target
+        double* d
+        double* step
+        double* coupling
+        double* inv_inertia_arm
+    ctypedef struct targets_t "lavender_targets":
+        double h
+        double beta
+        double slop
+        double bounce
+        int warm
     ctypedef struct manifolds_t "lavender_manifolds":
         int32_t n_groups
-        int32_t n_sweeps            # sweeps that one pass over the groups makes
+        double* v
     int HAS_MANIFOLDS "LAVENDER_HAS_MANIFOLDS"
     int has_avx2 "lavender_has_avx2"() noexcept nogil
-    int pack_manifolds "lavender_pack_manifolds"(const contacts_t* c, int32_t n_sweeps, double least,
-                                                 manifolds_t* m) noexcept nogil
-    void sweep_manifolds "lavender_sweep_manifolds"(const contacts_t* c, manifolds_t* m, int wide, int32_t sweeps, int backwards,
-                                                    double* lam, double* v) noexcept nogil
     void free_manifolds "lavender_free_manifolds"(manifolds_t* m) noexcept nogil
-
-
-cdef inline contacts_t bind_contacts(const blocks_t* p, const rows_t* r, const int32_t* order) noexcept nogil:
-    """Return the contacts of a problem without joints in an order (k)."""
-    cdef contacts_t c
-    c.n, c.n_bodies, c.order, c.ptr, c.body, c.mu, c.b, c.step = (
-        p.n_blocks, r.n_bodies, order, p.ptr, r.contact_body, p.mu, p.b, p.step)
-    c.normal, c.tangent, c.arm_a, c.arm_b = r.normal, r.tangent, r.arm_a, r.arm_b
-    c.inv_mass, c.inv_inertia_arm, c.coupling = r.inv_mass, r.inv_inertia_arm, r.coupling
-    return c
-
-
-cdef inline bint fits_lanes(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return whether all blocks are contacts with two tangents in a disk and without compliance."""
-    cdef int32_t i
-    if not HAS_MANIFOLDS or r.n_joints > 0 or p.n_blocks == 0:
-        return False
-    for i in range(p.n_blocks):
-        if not is_disk_friction_contact(p, i):
-            return False
-    for i in range(p.n_rows):
-        if r.compliance[i] != 0.0:
-            return False
-    return True
+    int pack_manifolds "lavender_pack_manifolds"(const contacts_t* c, int wide, int32_t n_sweeps, double least,
+                                                 manifolds_t* m) noexcept nogil
+    void refresh_manifolds "lavender_refresh_manifolds"(const contacts_t* c, manifolds_t* m, int wide, const targets_t* t,
+                                                        const double* free, const double* before,
+                                                        const int32_t* body_of) noexcept nogil
+    void sweep_manifolds "lavender_sweep_manifolds"(manifolds_t* m, int wide, int32_t sweeps, int backwards) noexcept nogil
+    void follow_manifolds "lavender_follow_manifolds"(const contacts_t* c, manifolds_t* m, int wide,
+                                                      const double* s) noexcept nogil
+    double check_manifolds "lavender_check_manifolds"(const contacts_t* c, const manifolds_t* m, int* finite) noexcept nogil
+    void store_manifolds "lavender_store_manifolds"(const contacts_t* c, const manifolds_t* m, int rows) noexcept nogil
+    void store_velocities "lavender_store_velocities"(int32_t n, const double* from_, double* to) noexcept nogil

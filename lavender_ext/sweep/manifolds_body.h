@@ -1,4 +1,4 @@
-/* Sweeps over groups of manifolds for one set of instructions, see manifolds.h, which defines and this file removes
+/* Passes over groups of manifolds for one set of instructions, see manifolds.h, which defines and this file removes
  *
  *     FOUR(f)     name of function f
  *     ISA         attribute that selects the instructions
@@ -22,16 +22,9 @@ ISA LAVENDER_INLINE_FOUR void FOUR(store_bodies)(double* v, const int32_t* at, c
     STORE_TWO(a + 4, b + 4, c + 4, d + 4, in + 4);
 }
 
-/* Update point p of each lane: `relax_contact` of core/contact.pxd for two tangents in a disk and no compliance. The impulses (3)
- * and the negative right-hand sides (3) of a contact are at x + its offset. */
-ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavender_point* p, const int32_t* at, double* x,
-                                          lavender_four* va, lavender_four* vb) {
-    const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
-    double *x0 = x + at[0], *x1 = x + at[1], *x2 = x + at[2], *x3 = x + at[3];
-    lavender_four lam[4], minus_b[4], u[3], impulse[3], change[3];
-    LOAD_FOUR(x0, x1, x2, x3, lam);
-    LOAD_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, minus_b);
-    /* relative velocity */
+/* Relative velocity u (3) at a point of each lane, (1) of core/rows.pxd. */
+ISA LAVENDER_INLINE_FOUR void FOUR(relative_velocity)(const lavender_point* p, const lavender_four* va, const lavender_four* vb,
+                                                      lavender_four* u) {
     const lavender_four *ra = p->arm_a, *rb = p->arm_b;
     u[0] = vb[0] + (vb[4] * rb[2] - vb[5] * rb[1]);
     u[1] = vb[1] + (vb[5] * rb[0] - vb[3] * rb[2]);
@@ -39,18 +32,170 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
     u[0] = u[0] - (va[0] + (va[4] * ra[2] - va[5] * ra[1]));
     u[1] = u[1] - (va[1] + (va[5] * ra[0] - va[3] * ra[2]));
     u[2] = u[2] - (va[2] + (va[3] * ra[1] - va[4] * ra[0]));
+}
+
+ISA LAVENDER_INLINE_FOUR void FOUR(cross)(const lavender_four* a, const lavender_four* b, lavender_four* out) {
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* Diagonal d (2 of each contact), steps, couplings and I^-1 (arm x axis) of all points: `compute_contact_delassus_block` of
+ * core/rows.pxd and `finish_pair` of core/steps.pxd for two tangents in a disk. inverse (bodies + 1, 12): inverse inertia. */
+ISA static void FOUR(rows)(const lavender_group* g, lavender_rows* rows, const double* inverse, double* d) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0}, one = zero + 1.0, half = zero + 0.5;
+    const lavender_four* axis = g->axis;
+    const lavender_four mass = (zero + g->inv_mass_a) + g->inv_mass_b;
+    const lavender_four d_n = mass * LAVENDER_DOT_FOUR(axis, axis), d_1 = mass * LAVENDER_DOT_FOUR(axis + 3, axis + 3);
+    const lavender_four d_2 = mass * LAVENDER_DOT_FOUR(axis + 6, axis + 6), c_1 = mass * LAVENDER_DOT_FOUR(axis + 3, axis);
+    const lavender_four c_2 = mass * LAVENDER_DOT_FOUR(axis + 6, axis), off_12 = mass * LAVENDER_DOT_FOUR(axis + 3, axis + 6);
+    lavender_four inv[2][12];
+    for (int side = 0; side < 2; side++) {
+        const int32_t* at = side ? g->read_b : g->read_a;
+        const double *a = inverse + 3 * (at[0] / 2), *b = inverse + 3 * (at[1] / 2), *c = inverse + 3 * (at[2] / 2);
+        const double* e = inverse + 3 * (at[3] / 2);
+        for (int k = 0; k < 12; k += 4) LOAD_FOUR(a + k, b + k, c + k, e + k, inv[side] + k);
+    }
+    for (int j = 0; j < g->n; j++) {
+        const lavender_point* p = g->point + j;
+        lavender_rows* out = rows + j;
+        lavender_four sum[6] = {zero, zero, zero, zero, zero, zero};    /* d, coupling, A_t1t2 */
+        for (int side = 0; side < 2; side++) {
+            lavender_four l[9], k[9];
+            for (int i = 0; i < 9; i += 3) {
+                FOUR(cross)(side ? p->arm_b : p->arm_a, axis + i, l + i);
+                for (int q = 0; q < 3; q++) {
+                    k[i + q] = LAVENDER_DOT_FOUR(inv[side] + 3 * q, l + i);
+                    out->inv_inertia_arm[2 * i + 3 * side + q] = k[i + q];
+                }
+                sum[i / 3] = sum[i / 3] + LAVENDER_DOT_FOUR(l + i, k + i);
+            }
+            sum[3] = sum[3] + LAVENDER_DOT_FOUR(l + 3, k);
+            sum[4] = sum[4] + LAVENDER_DOT_FOUR(l + 6, k);
+            sum[5] = sum[5] + LAVENDER_DOT_FOUR(l + 3, k + 6);
+        }
+        const lavender_four a = sum[1] + d_1, b = sum[5] + off_12, c = sum[2] + d_2, h = half * (a - c);
+        const lavender_four eigenvalue = half * (a + c) + ROOT(h * h + b * b), pair = half * (a + c);
+        const lavender_four most = LAVENDER_PICK_FOUR(eigenvalue > zero, eigenvalue, pair);
+        lavender_four both[2];
+        both[0] = sum[0] + d_n;
+        both[1] = pair;
+        out->step[0] = LAVENDER_PICK_FOUR(both[0] > zero, one / both[0], zero);
+        out->step[1] = LAVENDER_PICK_FOUR(most > zero, one / most, zero);
+        out->coupling[0] = sum[3] + c_1;
+        out->coupling[1] = sum[4] + c_2;
+        const int32_t* at = g->contact[j];
+        double *d0 = d + at[0] / 4, *d1 = d + at[1] / 4, *d2 = d + at[2] / 4, *d3 = d + at[3] / 4;
+        STORE_TWO(d0, d1, d2, d3, both);
+    }
+}
+
+/* Let the gaps follow the displacement of the bodies, (5) of engine/contacts.pxd. */
+ISA static void FOUR(follow)(const lavender_group* g, const double* shift, double* x) {
+    lavender_four sa[6], sb[6], u[3];
+    FOUR(load_bodies)(shift, g->read_a, sa);
+    FOUR(load_bodies)(shift, g->read_b, sb);
+    for (int j = 0; j < g->n; j++) {
+        const int32_t* at = g->contact[j];
+        FOUR(relative_velocity)(g->point + j, sa, sb, u);
+        const lavender_four closing = LAVENDER_DOT_FOUR(g->axis, u);
+        for (int lane = 0; lane < 4; lane++) x[at[lane] + 3] += closing[lane];
+    }
+}
+
+/* Right-hand sides for the velocities `free`, the gaps and the impulses: (1) to (4) of engine/contacts.pxd. With f, also add
+ * J^T lam to the wrenches f of the bodies: `add_contact_wrench` of core/velocity.pxd. */
+ISA static void FOUR(refresh)(const lavender_group* g, const lavender_targets* t, int backwards, const double* free,
+                              const double* before, double* x, double* f) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0}, h = zero + t->h;
+    lavender_four va[6], vb[6], ua[6], ub[6], fa[6], fb[6], old_a[6], old_b[6];
+    FOUR(load_bodies)(free, g->read_a, va);
+    FOUR(load_bodies)(free, g->read_b, vb);
+    if (before) {
+        FOUR(load_bodies)(before, g->read_a, ua);
+        FOUR(load_bodies)(before, g->read_b, ub);
+    }
+    if (f) {
+        FOUR(load_bodies)(f, g->read_a, fa);
+        FOUR(load_bodies)(f, g->read_b, fb);
+    }
+    for (int j = 0; j < g->n; j++) {
+        const int k = backwards ? g->n - 1 - j : j;
+        const lavender_point* p = g->point + k;
+        const int32_t* at = g->contact[k];
+        double *x0 = x + at[0], *x1 = x + at[1], *x2 = x + at[2], *x3 = x + at[3];
+        lavender_four lam[4], u[3], out[4], b, force[3], l[3];
+        if (!t->warm) x0[0] = x1[0] = x2[0] = x3[0] = x0[1] = x1[1] = x2[1] = x3[1] = x0[2] = x1[2] = x2[2] = x3[2] = 0.0;
+        LOAD_FOUR(x0, x1, x2, x3, lam);
+        FOUR(relative_velocity)(p, va, vb, u);
+        lavender_four gap = lam[3];
+        const lavender_four_bits open = gap > zero;
+        gap = LAVENDER_PICK_FOUR(lam[0] > zero, t->beta * (gap - t->slop), gap);
+        lavender_four target = LAVENDER_PICK_FOUR(open & (gap > zero), -gap / h, zero);
+        b = zero - LAVENDER_DOT_FOUR(g->axis, u);
+        if (before) {
+            lavender_four v[3];
+            FOUR(relative_velocity)(p, ua, ub, v);
+            const lavender_four speed = LAVENDER_DOT_FOUR(g->axis, v), back = -g->bounce * speed;
+            const lavender_four_bits closes = (g->bounce > zero) & (lam[3] - h * b <= zero) & (speed < -(zero + t->bounce));
+            target = LAVENDER_PICK_FOUR(closes & (back > target), back, target);
+        }
+        out[0] = zero - (target + b);
+        out[1] = zero - (zero - LAVENDER_DOT_FOUR(g->axis + 3, u));
+        out[2] = zero - (zero - LAVENDER_DOT_FOUR(g->axis + 6, u));
+        out[3] = target;
+        STORE_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, out);
+        if (!f) continue;
+        for (int i = 0; i < 6; i++) {
+            old_a[i] = fa[i];
+            old_b[i] = fb[i];
+        }
+        for (int i = 0; i < 3; i++) force[i] = (lam[0] * g->axis[i] + lam[1] * g->axis[3 + i]) + lam[2] * g->axis[6 + i];
+        FOUR(cross)(p->arm_a, force, l);
+        for (int i = 0; i < 3; i++) {
+            fa[i] = fa[i] - force[i];
+            fa[3 + i] = fa[3 + i] - l[i];
+        }
+        FOUR(cross)(p->arm_b, force, l);
+        for (int i = 0; i < 3; i++) {
+            fb[i] = fb[i] + force[i];
+            fb[3 + i] = fb[3 + i] + l[i];
+        }
+        if (k < g->n_all) continue;
+        const lavender_four_bits has = LAVENDER_HAS_POINT(g, k);
+        for (int i = 0; i < 6; i++) {
+            fa[i] = LAVENDER_PICK_FOUR(has, fa[i], old_a[i]);
+            fb[i] = LAVENDER_PICK_FOUR(has, fb[i], old_b[i]);
+        }
+    }
+    if (f) {
+        FOUR(store_bodies)(f, g->write_a, fa);
+        FOUR(store_bodies)(f, g->write_b, fb);
+    }
+}
+
+/* Update point p of each lane: `relax_contact` of core/contact.pxd for two tangents in a disk and no compliance. At x + its
+ * offset a contact has its impulses (3), gap, negative right-hand sides (3) and target. */
+ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavender_point* p, const lavender_rows* r, const int32_t* at, double* x,
+                                          lavender_four* va, lavender_four* vb) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
+    double *x0 = x + at[0], *x1 = x + at[1], *x2 = x + at[2], *x3 = x + at[3];
+    lavender_four lam[4], minus_b[4], u[3], impulse[3], change[3];
+    LOAD_FOUR(x0, x1, x2, x3, lam);
+    LOAD_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, minus_b);
+    FOUR(relative_velocity)(p, va, vb, u);
     /* normal */
-    lavender_four slack = LAVENDER_DOT_FOUR(g->normal, u) + minus_b[0];
-    lavender_four normal = lam[0] - slack * p->step[0];
+    lavender_four slack = LAVENDER_DOT_FOUR(g->axis, u) + minus_b[0];
+    lavender_four normal = lam[0] - slack * r->step[0];
     normal = LAVENDER_PICK_FOUR(normal < zero, zero, normal);
     change[0] = normal - lam[0];
-    for (int k = 0; k < 3; k++) impulse[k] = change[0] * g->normal[k];
+    for (int k = 0; k < 3; k++) impulse[k] = change[0] * g->axis[k];
     /* tangents */
     const lavender_four bound = g->mu * normal;
-    slack = (LAVENDER_DOT_FOUR(g->tangent1, u) + minus_b[1]) + p->coupling[0] * change[0];
-    lavender_four first = lam[1] - slack * p->step[1];
-    slack = (LAVENDER_DOT_FOUR(g->tangent2, u) + minus_b[2]) + p->coupling[1] * change[0];
-    lavender_four second = lam[2] - slack * p->step[1];
+    slack = (LAVENDER_DOT_FOUR(g->axis + 3, u) + minus_b[1]) + r->coupling[0] * change[0];
+    lavender_four first = lam[1] - slack * r->step[1];
+    slack = (LAVENDER_DOT_FOUR(g->axis + 6, u) + minus_b[2]) + r->coupling[1] * change[0];
+    lavender_four second = lam[2] - slack * r->step[1];
     const lavender_four square = first * first + second * second;
     const lavender_four_bits outside = square > bound * bound;
     if (ANY(outside)) {
@@ -64,10 +209,10 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
     lam[1] = first;
     lam[2] = second;
     STORE_FOUR(x0, x1, x2, x3, lam);
-    for (int k = 0; k < 3; k++) impulse[k] = (impulse[k] + change[1] * g->tangent1[k]) + change[2] * g->tangent2[k];
+    for (int k = 0; k < 3; k++) impulse[k] = (impulse[k] + change[1] * g->axis[3 + k]) + change[2] * g->axis[6 + k];
     /* velocities of both bodies */
     for (int k = 0; k < 3; k++) {
-        const lavender_four *i = p->inv_inertia_arm + k, *j = i + 3;
+        const lavender_four *i = r->inv_inertia_arm + k, *j = i + 3;
         va[k] = va[k] - g->inv_mass_a * impulse[k];
         va[3 + k] = va[3 + k] - ((change[0] * i[0] + change[1] * i[6]) + change[2] * i[12]);
         vb[k] = vb[k] + g->inv_mass_b * impulse[k];
@@ -75,23 +220,24 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
     }
 }
 
-/* Update all manifolds of a group. Points that not every lane has change only the lanes that have them. */
-ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, int backwards, double* x, double* v) {
+/* Update all manifolds of a group. A point that not every lane has changes only the lanes that have it. */
+ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, const lavender_rows* rows, int backwards, double* x,
+                                                double* v) {
     lavender_four va[6], vb[6], old_a[6], old_b[6];
     FOUR(load_bodies)(v, g->read_a, va);
     FOUR(load_bodies)(v, g->read_b, vb);
     for (int j = 0; j < g->n; j++) {
         const int k = backwards ? g->n - 1 - j : j;
         if (k < g->n_all) {
-            FOUR(relax)(g, g->point + k, g->contact[k], x, va, vb);
+            FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, va, vb);
             continue;
         }
         for (int i = 0; i < 6; i++) {
             old_a[i] = va[i];
             old_b[i] = vb[i];
         }
-        FOUR(relax)(g, g->point + k, g->contact[k], x, va, vb);
-        const lavender_four_bits has = {-(g->count[0] > k), -(g->count[1] > k), -(g->count[2] > k), -(g->count[3] > k)};
+        FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, va, vb);
+        const lavender_four_bits has = LAVENDER_HAS_POINT(g, k);
         for (int i = 0; i < 6; i++) {
             va[i] = LAVENDER_PICK_FOUR(has, va[i], old_a[i]);
             vb[i] = LAVENDER_PICK_FOUR(has, vb[i], old_b[i]);
@@ -101,10 +247,17 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, int bac
     FOUR(store_bodies)(v, g->write_b, vb);
 }
 
-ISA static void FOUR(sweep)(const lavender_manifolds* m, int backwards, double* x, double* v) {
-    for (int i = 0; i < m->n_groups; i++) {
-        const int k = backwards ? m->n_groups - 1 - i : i;
-        FOUR(relax_group)((const lavender_group*)(m->groups + m->start[k]), backwards, x, v);
+/* One pass over all groups; `t` and `before` are for LAVENDER_REFRESH, and `f` receives the wrenches. */
+ISA static void FOUR(run)(const lavender_manifolds* m, int what, int backwards, const lavender_targets* t, const double* before,
+                          double* f) {
+    const int of_sweep = what == LAVENDER_SWEEP, n = of_sweep ? m->n_groups : m->n_once;
+    const size_t* start = of_sweep ? m->start : m->start_once;
+    for (int i = 0; i < n; i++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + start[backwards ? n - 1 - i : i]);
+        if (what == LAVENDER_SWEEP) FOUR(relax_group)(g, m->rows + g->first_row, backwards, m->x, m->v);
+        else if (what == LAVENDER_ROWS) FOUR(rows)(g, m->rows + g->first_row, m->inverse, m->d);
+        else if (what == LAVENDER_REFRESH) FOUR(refresh)(g, t, backwards, m->free, before, m->x, f);
+        else FOUR(follow)(g, m->free, m->x);
     }
 }
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.sim.engine.layout import HEAD
 
 
 def build_scene(name: str, **options) -> lv.Scene:
@@ -31,7 +32,7 @@ def build_scene(name: str, **options) -> lv.Scene:
 
 
 def run_in_lanes(scene: lv.Scene, lanes: int, calls: tuple[int, ...]) -> list[bytes]:
-    """Return positions, velocities and impulses after runs of these numbers of steps."""
+    """Return positions, velocities and the last substep's problem after runs of these numbers of steps."""
     simulation = lv.Simulation(scene)
     seen = []
     for steps in calls:
@@ -40,7 +41,12 @@ def run_in_lanes(scene: lv.Scene, lanes: int, calls: tuple[int, ...]) -> list[by
             simulation.step()
         observation = simulation.run(3)[0]
         seen += [observation[name].tobytes() for name in ("positions", "velocities")]
-        seen.append(simulation.state.a["impulse"].tobytes())
+        state = simulation.state
+        contacts, rows = state.head[HEAD["contacts"]], state.head[HEAD["contact_rows"]]
+        for name in ("gap", "coupling", "normal", "key"):
+            seen.append(state.a[name][:contacts].tobytes())
+        for name in ("impulse", "b", "d", "step", "inv_inertia_arm"):
+            seen.append(state.a[name][:rows].tobytes())
     return seen
 
 
@@ -62,6 +68,10 @@ def run_in_lanes(scene: lv.Scene, lanes: int, calls: tuple[int, ...]) -> list[by
         ("boxes 20", {"restitution": 0.5}),
         ("spheres 40", {}),
         ("boxes 20", {"gravity": (0, 0, 0)}),
+        ("boxes 20", {"restitution": 0.7, "restitution_threshold": 0.0, "substeps": 2}),
+        ("wall 5", {"slop": 0.0}),
+        ("boxes 30", {"friction": 0.0}),
+        ("boxes 30", {"friction_shape": "box"}),
     ),
 )
 def test_lanes_have_the_bits_of_single_contacts(name, options, lanes):
