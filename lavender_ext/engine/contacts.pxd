@@ -523,11 +523,11 @@ cdef inline int32_t renew_contacts(engine_t* e) noexcept nogil:
     return n
 
 
-cdef inline void finish_contacts(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Build the rows of the new contacts, and write the right-hand sides of all."""
+cdef inline void finish_contacts(engine_t* e, const blocks_t* p, const rows_t* r, bint all_rows) noexcept nogil:
+    """Build the rows of the new contacts, or with `all_rows` of all contacts, and write the right-hand sides of all."""
     cdef int32_t c, block
     for c in range(e.head[H_CONTACTS]):
-        if e.head[H_REBUILT] and e.order_scratch[c] < 0:
+        if e.head[H_REBUILT] and (all_rows or e.order_scratch[c] < 0):
             block = e.size[N_JOINT] + c
             build_contact_rows(e, c, count_tangent_rows(p, block), count_angular_rows(p, block))
         refresh_contact(e, p, r, c)

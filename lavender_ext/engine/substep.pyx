@@ -86,7 +86,7 @@ cdef int32_t prepare_substep(engine_t* e) noexcept nogil:
     cdef rows_t r
     cdef int32_t status = prepare_contacts(e, &p, &r)
     if status == OK:
-        finish_contacts(e, &p, &r)
+        finish_contacts(e, &p, &r, False)
     return status
 
 
@@ -317,6 +317,7 @@ cdef struct packs_t:            # packed blocks of the substeps of a call: in od
     bint has_manifolds          # They hold the contacts of the present substep; the rows of the engine's arrays are out of date.
     bint tried                  # It is known whether groups can hold the contacts.
     bint stored                 # The arrays have these rows, too.
+    bint all_rows               # Without groups, the rows of kept contacts must be built, too.
     int32_t way
     int32_t lanes
     packed_t packed[2]          # pairs of blocks, for each order
@@ -370,27 +371,26 @@ cdef inline bint enter_lanes(engine_t* e, const blocks_t* p, packs_t* packs) noe
     if packs.tried and not e.head[H_REBUILT]:
         return packs.has_manifolds
     packs.tried = True
+    packs.all_rows = packs.has_manifolds                # The arrays have no rows of kept contacts.
     packs.has_manifolds = (HAS_MANIFOLDS and packs.lanes > 1 and e.size[N_JOINT] == 0 and p.n_blocks > MAX_POINTS
                            and e.head[H_ORDER] != SYMMETRICALLY and e.head[H_ORDER] != AT_RANDOM)
     for i in range(p.n_blocks):
         packs.has_manifolds = packs.has_manifolds and is_disk_friction_contact(p, i)
     if packs.has_manifolds:
         set_sweep_order_of_blocks(e)
+        packs.all_rows = True                           # The scratch memory no longer tells the new contacts.
         packs.way = get_sweep_direction(e)
         c = bind_contacts(e)
         packs.has_manifolds = pack_manifolds(&c, packs.lanes == 4, sweeps if sweeps <= MAX_UNROLLED_SWEEPS else 1, MIN_LANES,
                                              &packs.manifolds)
         packs.stored = False
-    if not packs.has_manifolds:
-        for i in range(p.n_blocks):                     # `finish_contacts` builds the rows of kept contacts, too.
-            e.order_scratch[i] = -1
     return packs.has_manifolds
 
 
-cdef inline void store_lanes(engine_t* e, packs_t* packs, bint rows) noexcept nogil:
-    """Write impulses, gaps, and with `rows` also the rows of the groups to the engine's arrays."""
+cdef inline void store_lanes(engine_t* e, packs_t* packs, bint rows, int32_t first_target) noexcept nogil:
+    """Write impulses, gaps, and with `rows` also the rows, and targets from first_target on, to the engine's arrays."""
     cdef contacts_t c = bind_contacts(e)
-    store_manifolds(&c, &packs.manifolds, rows)
+    store_manifolds(&c, &packs.manifolds, rows, first_target)
     packs.stored = packs.stored or rows
 
 
@@ -404,13 +404,13 @@ cdef inline void solve_in_lanes(engine_t* e, packs_t* packs, bint measures) noex
     refresh_manifolds(&c, &packs.manifolds, wide, &t, e.v_free, e.v, e.body_of)
     if measures:
         set_sweep_order_of_blocks(e)
-        store_lanes(e, packs, True)
+        store_lanes(e, packs, True, 0)
         store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
         measure_contact_errors(e, e.setting + S_OUT + 4, e.setting + S_OUT + 6)
     sweep_manifolds(&packs.manifolds, wide, e.head[H_ITERATIONS], get_sweep_direction(e) != packs.way)
     store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
     if measures:
-        store_lanes(e, packs, False)
+        store_lanes(e, packs, False, 0)
         measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
@@ -419,14 +419,15 @@ cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs) noexcept nogil:
     cdef contacts_t c = bind_contacts(e)
     cdef int finite
     cdef double depth = check_manifolds(&c, &packs.manifolds, &finite)
+    cdef bint projects = depth > e.setting[S_SLOP] and e.head[H_POSITION_ITERATIONS] > 0
     cdef int32_t shifted = 0, nonfinite_body = -1, any_due = 0
     store_statistics(e)
     # projection, integration
     if not finite or not all_finite(e.setting + S_OUT, 8):
-        store_lanes(e, packs, True)
+        store_lanes(e, packs, True, 0)
         nonfinite_body = find_nonfinite_body(e)
-    if depth > e.setting[S_SLOP] and e.head[H_POSITION_ITERATIONS] > 0:
-        store_lanes(e, packs, not packs.stored)
+    if projects:
+        store_lanes(e, packs, not packs.stored, 0)
         shifted = project_positions(e)
     else:
         e.head[H_PROJECTED] = 0
@@ -440,20 +441,21 @@ cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs) noexcept nogil:
         any_due = find_due_bodies(e, shifted)
         follow_manifolds(&c, &packs.manifolds, packs.lanes == 4, e.shift)
         if any_due:
-            store_lanes(e, packs, False)
+            # Contacts that end here leave their rows in the arrays. The projection has used the first targets.
+            store_lanes(e, packs, True, e.head[H_CONTACTS] if projects else 0)
             store_contact_cache(e)
     else:
-        store_lanes(e, packs, False)
+        store_lanes(e, packs, False, 0)
         store_contact_cache(e)
     if e.head[H_LOST] >= 0:
-        store_lanes(e, packs, not packs.stored)
+        store_lanes(e, packs, not packs.stored, 0)
     return end_substep(e)
 
 
 cdef inline void solve_packed_substep(engine_t* e, const blocks_t* p, const rows_t* r, packs_t* packs,
                                       bint measures) noexcept nogil:
     """Complete and solve the substep's problem as `solve_substep`, with the same bits, over packed blocks if that pays."""
-    finish_contacts(e, p, r)
+    finish_contacts(e, p, r, packs.all_rows)
     start_solve(e, p, r, measures)
     set_sweep_order_of_blocks(e)
     if packs.lanes == 0 or not sweep_packed_blocks(e, p, r, packs):
@@ -469,13 +471,13 @@ cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, packs_t* packs, 
     cdef int32_t status = OK
     cdef bint last
     done[0] = 0
-    packs.tried = packs.has_manifolds = packs.is_valid[0] = packs.is_valid[1] = False
+    packs.tried = packs.has_manifolds = packs.all_rows = packs.is_valid[0] = packs.is_valid[1] = False
     while status == OK and done[0] < n:
         last = done[0] == n - 1
         status = prepare_contacts(e, &p, &r)
         if status != OK:
             if packs.has_manifolds:
-                store_lanes(e, packs, not packs.stored)
+                store_lanes(e, packs, not packs.stored, 0)
         elif enter_lanes(e, &p, packs):
             solve_in_lanes(e, packs, last)
             status = finish_in_lanes(e, packs)

@@ -446,15 +446,16 @@ static double lavender_check_manifolds(const lavender_contacts* c, const lavende
     return depth;
 }
 
-/* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them. */
-static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows) {
+/* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them, and the targets of rows
+ * from first_target on. */
+static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows, int32_t first_target) {
     for (size_t i = 0; i < (size_t)c->n; i++) {
         const double* x = m->x + 8 * i;
         for (size_t k = 0; k < 3; k++) c->impulse[3 * i + k] = x[k];
         c->gap[i] = x[3];
         for (size_t k = 0; k < 3 && rows; k++) {
             c->b[3 * i + k] = 0.0 - x[4 + k];
-            c->target[3 * i + k] = k ? 0.0 : x[7];
+            if (3 * i + k >= (size_t)first_target) c->target[3 * i + k] = k ? 0.0 : x[7];
             c->d[3 * i + k] = m->d[2 * i + (k > 0)];
         }
     }
@@ -484,7 +485,7 @@ typedef struct {
 #define lavender_sweep_manifolds(m, wide, sweeps, backwards) ((void)(wide), (void)(sweeps), (void)(backwards))
 #define lavender_follow_manifolds(c, m, wide, s) ((void)(c))
 #define lavender_check_manifolds(c, m, finite) ((void)(c), *(finite) = 1, 0.0)
-#define lavender_store_manifolds(c, m, rows) ((void)(c), (void)(rows))
+#define lavender_store_manifolds(c, m, rows, first_target) ((void)(c), (void)(rows), (void)(first_target))
 #define lavender_store_velocities(n, from, to) ((void)(n))
 #endif
 #endif

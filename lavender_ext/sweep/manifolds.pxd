@@ -54,5 +54,6 @@ cdef extern from "lavender_ext/sweep/manifolds.h":
     void follow_manifolds "lavender_follow_manifolds"(const contacts_t* c, manifolds_t* m, int wide,
                                                       const double* s) noexcept nogil
     double check_manifolds "lavender_check_manifolds"(const contacts_t* c, const manifolds_t* m, int* finite) noexcept nogil
-    void store_manifolds "lavender_store_manifolds"(const contacts_t* c, const manifolds_t* m, int rows) noexcept nogil
+    void store_manifolds "lavender_store_manifolds"(const contacts_t* c, const manifolds_t* m, int rows,
+                                                    int32_t first_target) noexcept nogil
     void store_velocities "lavender_store_velocities"(int32_t n, const double* from_, double* to) noexcept nogil
