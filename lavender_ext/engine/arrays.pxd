@@ -79,7 +79,8 @@ cpdef enum:
     S_DEPTH = 19            # m, deepest penetration
     S_JOINT_ERROR = 20      # m or rad, largest joint error
     S_ROLLING = 21          # m, mu_r of every contact with friction
-    N_SETTINGS = 22
+    S_JOINT_GIVE = 22       # -, compliance of the rows of rigid joints, relative to their d
+    N_SETTINGS = 23
 
 # The broad phase stops if more than MAX_PAIRS boxes overlap; it then reports PAIR_COUNT_OVERFLOW as the needed capacity.
 cpdef enum:
