@@ -14,6 +14,7 @@ from lavender.io.stored import as_path, check_writable, write_text
 from lavender.sim.engine import Simulation
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.sim.engine.snapshot import Snapshot
+from lavender.sim.engine.state import JOINT_GIVE
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, compute_array_offsets
 
@@ -39,6 +40,7 @@ def describe_layout() -> dict[str, Any]:
         "size": {**SIZE, "cap_pair": CAP_PAIR, "cap_contact": CAP_CONTACT},
         "head": HEAD,
         "setting": SETTING,
+        "joint_give": JOINT_GIVE,
         "joint": JOINT,
         "joint_kinds": JOINT_KINDS,
         "orders": ORDER_NUMBER,

@@ -233,12 +233,14 @@ export class Simulation {
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 
-  // Select the solver from the next step on: a Newton of the same kernels, or null for the sweeps. The number of substeps is
-  // the one that Python uses for it.
+  // Select the solver from the next step on: a Newton of the same kernels, or null for the sweeps. The number of substeps and
+  // the compliance of rigid joints are those that Python uses for it.
   use(newton) {
+    const { head, setting, joint_give } = this.k.layout;
     this.newton = newton;
     this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
-    this.array("setting")[this.k.layout.setting.h] = this.scene.dt / this.substeps;
+    this.array("setting")[setting.h] = this.scene.dt / this.substeps;
+    this.array("setting")[setting.joint_give] = newton && this.array("head")[head.position_iterations] > 0 ? joint_give : 0;
     this.array("head")[this.k.layout.head.substeps] = this.substeps;
   }
 
