@@ -26,6 +26,15 @@ ISA static inline V LANE(root)(V a) { return ROOT(a); }
 ISA static inline int LANE(any)(I mask) { return ANY(mask); }
 ISA static inline I LANE(all)(I mask) { return sizeof(V) == sizeof(double) ? (I)(0 - mask) : mask; }  /* all bits */
 
+/* The friction law at a normal yn and tangents of length t: the normal s of the point on the bounds that is nearest for a cone
+ * (`law` 1), or max(0, yn) for Coulomb's disk (0). Return the disk's radius mu s. Cones are in the Euclidean metric. */
+ISA static inline V LANE(limit)(int law, V mu, V yn, V t, V* s) {
+    const V zero = {0.0};
+    *s = LANE(larger)(yn, zero);
+    if (law) *s = LANE(larger)((yn + mu * t) / (mu * mu + 1.0), *s);
+    return mu * *s;
+}
+
 /* The judge's errors e (m) of impulses with slack w, and sum d e^2, the largest nu d e^2 and its row (judge/tally.pxd). */
 ISA static void LANE(errors)(const lavender_lanes_t* x, const V* lam, const V* w, V* e, V* energy, V* fast, V* worst) {
     const V *d = (const V*)x->d, *mu = (const V*)x->mu;
@@ -46,19 +55,17 @@ ISA static void LANE(errors)(const lavender_lanes_t* x, const V* lam, const V* w
         if (x->law) {
             const V rn = LANE(root)(dn), rt = LANE(root)(dt), yn = rn * (lam[r] - un), a = f * rt / rn;
             const V y1 = rt * (lam[r + 1] - u1), y2 = rt * (lam[r + 2] - u2), t = LANE(root)(y1 * y1 + y2 * y2);
-            const V edge = (yn + a * t) / (1.0 + a * a);
-            V s = LANE(pick)((I)(yn > 0.0), yn, zero), bound, scale;
-            s = LANE(larger)(edge, s);
-            bound = a * s;
-            const V size = t * rt;
+            V s;
+            const V bound = LANE(limit)(1, a, yn, t, &s), size = t * rt;
             const I beyond = (I)(t > bound);
-            scale = LANE(pick)((I)(size > 0.0), bound / LANE(pick)((I)(size > 0.0), size, zero + 1.0), zero);
+            const V scale = LANE(pick)((I)(size > 0.0), bound / LANE(pick)((I)(size > 0.0), size, zero + 1.0), zero);
             e[r] = LANE(pick)((I)(s == yn), un, lam[r] - s / rn);
             e[r + 1] = LANE(pick)(beyond, lam[r + 1] - scale * y1, u1);
             e[r + 2] = LANE(pick)(beyond, lam[r + 2] - scale * y2, u2);
         } else {
-            const V bound = f * LANE(pick)((I)(lam[r] > 0.0), lam[r], zero), y1 = lam[r + 1] - u1, y2 = lam[r + 2] - u2;
-            const V t = LANE(root)(y1 * y1 + y2 * y2), scale = bound / t;
+            const V y1 = lam[r + 1] - u1, y2 = lam[r + 2] - u2, t = LANE(root)(y1 * y1 + y2 * y2);
+            V s;
+            const V bound = LANE(limit)(0, f, lam[r], t, &s), scale = bound / t;
             const I beyond = (I)(t > bound);
             e[r] = LANE(pick)((I)(un > lam[r]), lam[r], un);
             e[r + 1] = LANE(pick)(beyond, lam[r + 1] - scale * y1, u1);
@@ -85,13 +92,9 @@ ISA static void LANE(project)(int law, V mu, const V* y, V* to, V* p) {
     const V zero = {0.0}, one = zero + 1.0, square = mu * mu + 1.0;
     const V t = LANE(root)(y[1] * y[1] + y[2] * y[2]), length = LANE(pick)((I)(t > 0.0), t, one);
     const V u1 = y[1] / length, u2 = y[2] / length;
-    const V edge = (y[0] + mu * t) / square, flat = LANE(larger)(y[0], zero);
-    V s = flat, bound, weight = one;
-    if (law) {
-        s = LANE(larger)(edge, flat);
-        weight = one / square;
-    }
-    bound = mu * s;
+    V s, weight = one;
+    const V bound = LANE(limit)(law, mu, y[0], t, &s);
+    if (law) weight = one / square;
     const I off = (I)(s <= 0.0), inside = (I)(t <= bound);
     const V scale = LANE(pick)(off, zero, LANE(pick)(inside, one, bound / length)), other = LANE(pick)(inside, zero, scale);
     V ray1 = LANE(pick)(inside, zero, mu * u1), ray2 = LANE(pick)(inside, zero, mu * u2), first = LANE(pick)(inside, one, weight);
@@ -284,9 +287,9 @@ ISA static void LANE(bound)(const lavender_lanes_t* x, V* lam, int to_cones) {
         int r = x->ptr[i];
         for (; !x->kind[i] && r < x->ptr[i + 1]; r++) lam[r] = LANE(clip)(lam[r], lower[r], upper[r]);
         if (!x->kind[i]) continue;
-        lam[r] = LANE(larger)(lam[r], zero);
+        const V bound = LANE(limit)(0, mu[i], lam[r], zero, &lam[r]);
         if (to_cones) {
-            const V bound = mu[i] * lam[r], size = LANE(root)(lam[r + 1] * lam[r + 1] + lam[r + 2] * lam[r + 2]);
+            const V size = LANE(root)(lam[r + 1] * lam[r + 1] + lam[r + 2] * lam[r + 2]);
             const I beyond = (I)(size > (1.0 + 8.0 * 1.1102230246251565e-16) * bound);
             const V scale = LANE(pick)(beyond, bound / LANE(larger)(size, zero + 1e-300), zero + 1.0);
             lam[r + 1] *= scale;
