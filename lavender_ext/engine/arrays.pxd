@@ -79,7 +79,7 @@ cpdef enum:
     S_DEPTH = 19            # m, deepest penetration
     S_JOINT_ERROR = 20      # m or rad, largest joint error
     S_ROLLING = 21          # m, mu_r of every contact with friction
-    S_JOINT_GIVE = 22       # -, compliance of the rows of rigid joints, relative to their d
+    S_JOINT_GIVE = 22       # -, compliance of rigid joints in closed loops, relative to the mean d of their rows
     N_SETTINGS = 23
 
 # The broad phase stops if more than MAX_PAIRS boxes overlap; it then reports PAIR_COUNT_OVERFLOW as the needed capacity.
@@ -118,7 +118,8 @@ cpdef enum:
     J_DAMPING = 17          # -, damping ratio
     J_SPEED = 18            # rad/s, motor speed of b relative to a
     J_TORQUE = 19           # N m, maximum motor torque
-    N_JOINT_REAL = 20
+    J_LOOP = 20             # -, 1 if the joint is rigid and in a closed loop of rigid joints, else 0
+    N_JOINT_REAL = 21
 
 # arrays in each buffer
 cdef enum:

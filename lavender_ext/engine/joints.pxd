@@ -14,7 +14,8 @@ A rigid row keeps its error to second order: its target is -h/2 C''. The impulse
 as much before as after the tangent, and a pendulum neither gains nor loses energy from it (Ryckaert, Ciccotti, Berendsen
 1977). Without the term it loses the fraction (h omega)^2 of its energy in a substep. The position projection removes C. In a closed
 loop it leaves about 1e-6 m of C, so that rows which depend on the others do so no longer and resist every motion of the loop.
-Solvers that solve all rows therefore give rigid rows a compliance of S_JOINT_GIVE d.
+For solvers that solve all rows, the rigid joints of loops therefore have a compliance of S_JOINT_GIVE times the mean d of the
+linear rows, or of the angular rows: their sums are the same in all axes.
 
 A soft joint of frequency f and damping ratio zeta is a damped spring on the effective mass A^-1 of its block of rows,
 integrated implicitly (Catto 2011). Its rows are combined so that the block is diagonal: the angular rows along the principal
@@ -33,7 +34,7 @@ from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.block_types cimport ROW
 from lavender_ext.core.rows cimport cross, dot3, dot12, joint_row_velocity, multiply_inverse_mass, reciprocal_or_zero
 from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
-                                         J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
+                                         J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_LOOP, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, S_JOINT_GIVE, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_world
 from lavender_ext.core.vectors cimport copy3, subtract3, add_scaled3, scale3
@@ -320,6 +321,16 @@ cdef inline void store_joint_impulses(engine_t* e) noexcept nogil:
         raw[4] = dot3(other, moment)
 
 
+cdef inline void give_rows(engine_t* e, int32_t first, int32_t n) noexcept nogil:
+    """Give n rows from `first` on a compliance of S_JOINT_GIVE times the mean of their d."""
+    cdef int32_t row
+    cdef double total = 0.0
+    for row in range(first, first + n):
+        total += dot12(e.jac + 12 * row, e.minv_jac + 12 * row)
+    for row in range(first, first + n):
+        e.compliance[row] = e.setting[S_JOINT_GIVE] * total / n
+
+
 cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
     """Build rows, diagonal, compliance, right-hand side and warm start of all joints; e.v_free holds v*."""
     cdef int32_t i, row, a, b, k, n_linear
@@ -350,6 +361,10 @@ cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
             decouple_soft_rows(e, i)
             if e.head[H_WARM_START]:
                 start_combined_rows(e, i)
+        if e.setting[S_JOINT_GIVE] * p[J_LOOP] > 0.0:
+            give_rows(e, e.ptr[i], n_linear)
+            if e.joint_kind[i] == HINGE:
+                give_rows(e, e.ptr[i] + 3, 2)
         for row in range(e.ptr[i], e.ptr[i + 1]):
             d = dot12(e.jac + 12 * row, e.minv_jac + 12 * row)
             e.lower[row] = -inf
@@ -364,8 +379,6 @@ cdef inline void build_joint_rows(engine_t* e) noexcept nogil:
                 c = 2.0 * p[J_DAMPING] * omega / d
                 e.compliance[row] = 1.0 / (h * (c + h * stiffness))
                 e.target[row] = -e.joint_error[row] * stiffness / (c + h * stiffness)
-            elif p[J_HERTZ] == 0.0:
-                e.compliance[row] = e.setting[S_JOINT_GIVE] * d
             e.d[row] = d + e.compliance[row]
             e.step[row] = reciprocal_or_zero(e.d[row])
             e.b[row] = e.target[row] - joint_row_velocity(e.jac + 12 * row, e.v_free, a, b)

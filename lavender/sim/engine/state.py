@@ -10,6 +10,7 @@ import numpy as np
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
+from lavender.sim.engine.loops import find_loop_joints
 from lavender.sim.engine.values import SolverValues
 from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.sim.scene.parameters import SCENE_ORDERS, Parameters
@@ -38,8 +39,9 @@ assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 BRUTE_FORCE_MAX_SHAPES = 32
 BETA = 0.2  # [-] Fraction of a position error that a substep removes.
 MAX_PUSH = 0.2  # [m] A substep corrects at most this much of a position error.
-# [-] Compliance of rigid joints relative to d, for solvers that solve all rows: the position projection leaves errors
-# of about 1e-6 m in a closed loop, so that its redundant rows no longer depend on the others and would stop its motion.
+# [-] Compliance of the rigid joints of closed loops relative to d, for solvers that solve all rows: the position
+# projection leaves errors of about 1e-6 m in a loop, so that its redundant rows no longer depend on the others and
+# would stop its motion.
 JOINT_GIVE = 1e-5
 MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are rejected.
 
@@ -280,3 +282,6 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
         row += j.n_rows
         a["ptr"][i + 1] = row
+    # The static bodies and the world are one body of the loops.
+    rigid = [j.hertz == 0.0 for j in joints]
+    a["joint"][:, JOINT["loop"]] = find_loop_joints(a["joint_body"], rigid)

@@ -90,10 +90,15 @@ def test_gallery_scene_solved_by_newton_keeps_energy(name):
     assert result.gain <= 1e-2 * abs(result.start)
 
 
-def test_newton_locks_a_redundant_loop_unless_no_projection_moves_its_rows_apart():
-    sweeps, newton = (simulate("four_bar", 120, 20.0, s) for s in ("sequential_impulses", "newton"))
-    assert sweeps.end == pytest.approx(sweeps.start, rel=0.01)  # It swings.
-    assert newton.end < 0.1 * newton.start  # It has sunk, and hardly moves.
+@pytest.mark.parametrize("solver", ["sequential_impulses", "newton"])
+def test_redundant_loop_swings_and_keeps_its_energy(solver):
+    result = simulate("four_bar", 120, 20.0, solver)
+    assert (result.lost, result.failed) == ("", 0)
+    assert result.end == pytest.approx(result.start, rel=0.01)
+    assert result.drift > 1.0  # m
+
+
+def test_redundant_loop_without_projection_is_solved_and_swings():
     result = simulate("four_bar", 120, 3.0, "newton", position_iterations=0)
     assert (result.lost, result.failed) == ("", 0)
     assert result.drift > 0.1  # m
