@@ -199,7 +199,10 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
     const lavender_four square = first * first + second * second;
     const lavender_four_bits outside = square > bound * bound;
     if (ANY(outside)) {
-        const lavender_four scale = bound / ROOT(square);
+        /* Without a normal impulse the scale is 0, and no root is needed. */
+        const lavender_four_bits loaded = bound > zero;
+        lavender_four scale = bound;
+        if (ANY(outside & loaded)) scale = LAVENDER_PICK_FOUR(loaded, bound / ROOT(square), bound);
         first = LAVENDER_PICK_FOUR(outside, first * scale, first);
         second = LAVENDER_PICK_FOUR(outside, second * scale, second);
     }
