@@ -3,7 +3,8 @@
 Box3D is not a package; the user names a checkout of https://github.com/erincatto/box3d, from which CMake builds the
 library, without its validation. Both engines take steps of 1/60 s in four substeps; LavenderSim has four sweeps a
 substep. Box3D has soft contacts, one friction point with twist for each pair, and reuses the contacts of pairs that
-hardly move; LavenderSim has friction at each point and rigid contacts, and builds contacts in every step.
+hardly move; LavenderSim has friction at each point and rigid contacts, and builds contacts in every step, or keeps
+those of bodies that moved by less than `RECYCLE`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from lavender.sim.scene import Scene
 
 DT, SUBSTEPS, SWEEPS = 1 / 60, 4, 4
 FRICTION = 0.5
+RECYCLE = 1e-3  # m
 HALF = 0.5  # m, of all cubes
 SOURCE = Path(__file__).with_name("box3d_steps.c")
 
@@ -62,13 +64,13 @@ SCENES: dict[str, tuple[Callable[[], FloatArray], int, int]] = {
 
 @dataclass(frozen=True)
 class Beside:
-    """Results of both engines on one scene, LavenderSim first."""
+    """Results on one scene: LavenderSim, LavenderSim with kept contacts, Box3D."""
 
     scene: str
-    time: tuple[float, float]  # s, median CPU time of a step
-    ratio: float  # median of the rounds' ratios
-    lateral: tuple[float, float]  # m, largest displacement since the start
-    vertical: tuple[float, float]  # m
+    time: tuple[float, ...]  # s, median CPU time of a step
+    ratio: tuple[float, ...]  # medians of the rounds' ratios to Box3D, of the first two
+    lateral: tuple[float, ...]  # m, largest displacement since the start
+    vertical: tuple[float, ...]  # m
 
 
 def build(checkout: Path, folder: Path) -> Path:
@@ -135,8 +137,9 @@ class Box3D:
 class Lavender:
     """The same cubes in LavenderSim."""
 
-    def __init__(self, centres: FloatArray) -> None:
-        scene = Scene(dt=DT, substeps=SUBSTEPS, solver_iterations=SWEEPS, friction=FRICTION)
+    def __init__(self, centres: FloatArray, recycle: float) -> None:
+        given = {"substeps": SUBSTEPS, "solver_iterations": SWEEPS, "friction": FRICTION}
+        scene = Scene(dt=DT, recycle=recycle, **given)
         scene.add_plane()
         for centre in centres:
             scene.add_box((2 * HALF,) * 3, position=tuple(centre))
@@ -149,42 +152,34 @@ class Lavender:
 
 
 def measure(program: Path, scene: str, rounds: int = 5) -> Beside:
-    """Measure a scene in both engines, in alternating rounds."""
+    """Measure a scene in the engines, in alternating rounds."""
     make, settle, steps = SCENES[scene]
     centres = make()
-    engines = (Lavender(centres), Box3D(program, centres))
+    engines = (Lavender(centres, 0.0), Lavender(centres, RECYCLE), Box3D(program, centres))
     try:
         for engine in engines:
             engine.run(settle)
         results = [[engine.run(steps) for engine in engines] for _ in range(rounds)]
     finally:
-        engines[1].close()
+        engines[-1].close()
     moved = [np.asarray(places) - centres for _, places in results[-1]]
-    times = np.array([[time / steps for time, _ in both] for both in results])
-    lateral = [float(np.hypot(d[:, 0], d[:, 1]).max()) for d in moved]
-    vertical = [float(np.abs(d[:, 2]).max()) for d in moved]
+    times = np.array([[time / steps for time, _ in one] for one in results])
     return Beside(
         scene,
-        (median(times[:, 0]), median(times[:, 1])),
-        median(times[:, 0] / times[:, 1]),
-        (lateral[0], lateral[1]),
-        (vertical[0], vertical[1]),
+        tuple(map(median, times.T)),
+        tuple(median(times[:, i] / times[:, -1]) for i in range(2)),
+        tuple(float(np.hypot(d[:, 0], d[:, 1]).max()) for d in moved),
+        tuple(float(np.abs(d[:, 2]).max()) for d in moved),
     )
 
 
 def format_table(results: Sequence[Beside]) -> str:
-    """Return the results as a table in Markdown: CPU time of a step, ratio to Box3D, displacements."""
+    """Return the results as a table in Markdown: CPU times of a step, ratios to Box3D, displacements."""
     rows = []
     for r in results:
         moved = [f"{1e3 * a:.2f}/{1e3 * b:.2f}" for a, b in zip(r.lateral, r.vertical, strict=True)]
         times = [f"{1e6 * t:.1f}" for t in r.time]
-        rows.append([r.scene, *times, f"{r.ratio:.2f}", *moved])
-    head = (
-        "scene",
-        "LavenderSim, µs",
-        "Box3D, µs",
-        "ratio",
-        "lateral/vertical, mm",
-        "of Box3D, mm",
-    )
-    return markdown(head, rows)
+        rows.append([r.scene, *times, *(f"{x:.2f}" for x in r.ratio), *moved])
+    names = "LavenderSim", "with `recycle`", "Box3D"
+    head = [f"{name}, µs" for name in names] + [f"ratio {name}" for name in names[:2]]
+    return markdown(["scene", *head, *(f"moved {name}, mm" for name in names)], rows)

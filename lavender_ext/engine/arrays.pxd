@@ -49,8 +49,9 @@ cpdef enum:
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     H_FRICTION_SHAPE = 18   # 1: each tangent is bounded separately (box friction)
     H_SUBSTEPS = 19         # substeps of a step
-    H_PHASE = 20            # substeps that the present step has done; 0: the next one builds all contacts anew
+    H_PHASE = 20            # substeps that the present step has done; 0: the next one builds all contacts anew, but see H_KEPT
     H_REBUILT = 21          # 1: the last substep built contacts anew; 0: it kept the rows of the substep before
+    H_KEPT = 22             # 1: the first substep of the next step keeps contacts, as the others do
     N_HEAD = 24
 
 # H_ORDER: sweep order of the blocks; joints and contacts are ordered separately
@@ -80,7 +81,8 @@ cpdef enum:
     S_JOINT_ERROR = 20      # m or rad, largest joint error
     S_ROLLING = 21          # m, mu_r of every contact with friction
     S_JOINT_GIVE = 22       # -, compliance of rigid joints in closed loops, relative to the mean d of their rows
-    N_SETTINGS = 23
+    S_RECYCLE = 23          # m, contacts of bodies that move less are kept over steps; 0: they are built anew in each step
+    N_SETTINGS = 24
 
 # The broad phase stops if more than MAX_PAIRS boxes overlap; it then reports PAIR_COUNT_OVERFLOW as the needed capacity.
 cpdef enum:

@@ -46,13 +46,13 @@ SHAPES = {
         "v_free": (6,), "dv": (6,), "shift": (6,), "point": (3,), "gap": (), "normal": (3,), "tangent": (3,), "arm_a": (3,),
         "arm_b": (3,), "coupling": (5,), "inv_inertia_arm": (6,), "local": (6,), "cache_impulse": (N_CACHE_IMPULSE,),
         "cache_local": (6,), "push": (), "target": (), "lower": (), "upper": (), "b": (), "d": (), "step": (),
-        "compliance": (), "impulse": (), "mu": (), "patch_radius": (), "rolling": (), "cache_roll": (3,), "moved": None,
+        "compliance": (), "impulse": (), "mu": (), "patch_radius": (), "rolling": (), "cache_roll": (3,), "moved": (),
     },
     "index": {
         "head": (), "kind_of_shape": (), "dyn": (), "uneven": (), "body_of": (), "joint_kind": (), "joint_motor": (),
         "joint_bodies": (2,), "excluded": (2,), "pair": (2,), "pair_scratch": None, "count": None, "bucket": None,
         "chain": None, "cell": None, "contact_pair": (2,), "joint_body": (2,), "contact_body": (2,), "ptr": (), "kind": (),
-        "order": None, "order_scratch": None, "due": None,
+        "order": None, "order_scratch": None, "due": (),
     },
     "keys": {"key": (), "cache_key": (), "color_scratch": None},
 }

@@ -15,7 +15,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.validate cimport find_invalid_number
-from lavender_ext.engine.arrays cimport (H_PHASE, N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H,
+from lavender_ext.engine.arrays cimport (H_KEPT, H_PHASE, N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H,
                                          engine_t)
 from lavender_ext.core.vectors cimport copy3, add_scaled3, matvec3
 
@@ -104,6 +104,11 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
     multiply_by_world_tensor(r, inv_inertia, momentum, omega)
 
 
+cdef inline int32_t are_contacts_new(const engine_t* e) noexcept nogil:
+    """Return whether the coming substep builds all contacts anew."""
+    return e.head[H_PHASE] == 0 and not e.head[H_KEPT]
+
+
 cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
     """Compute frames, world inverse inertia and v* = v + h g of the coming substep.
 
@@ -117,7 +122,7 @@ cdef inline void begin_body_substep(engine_t* e) noexcept nogil:
             compute_rotation_matrix(e.q + 4 * i, e.rot + 9 * i)
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
-        if e.uneven[b] and (e.head[H_PHASE] == 0 or e.due[b]):
+        if e.uneven[b] and (are_contacts_new(e) or e.due[b]):
             rotate_tensor_to_world(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
         add_scaled3(e.v + 6 * b, h, g, e.v_free + 6 * i)
         copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)

@@ -24,6 +24,9 @@ while its bodies move little, and its gap follows to first order the displacemen
 A body is *due* if (5), with as much again for the coming substep, exceeds half the margin or r/100: its pairs are then built anew.
 So the bodies of a pair that is kept come closer by at most the margin, the normal turns by at most 0.02 rad, and the neglected
 term of second order is at most r/20000 for each body. Bodies of joints are always due, because their rows follow each pose.
+With S_RECYCLE, contacts are kept over steps, too, until `moved` of a body exceeds it at the end of a step. All bodies with more
+than a part of 1/EARLY are then due, since groups of manifolds are formed anew for one new contact as for many, and if these are
+most bodies, all contacts are built anew.
 
 Under the alternating order, the sweeps of every second substep run from the last point of the last pair to the first: a sweep in
 one direction leaves its error on one side of a face, and the next sweep on the other. The first substep of a step builds its
@@ -43,15 +46,19 @@ from lavender_ext.core.steps cimport finish_pair
 from lavender_ext.core.rows cimport (compute_contact_delassus_block, compute_contact_velocity, cross, dot3,
                                      largest_eigenvalue_2x2, reciprocal_or_zero, compute_relative_velocity)
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
+from lavender_ext.engine.arrays cimport (ALTERNATING, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS, H_KEPT,
                                          H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_PHASE, H_REBUILT, H_STEP,
                                          H_WARM_START, NO_SHAPE, N_BODY, N_CACHE_IMPULSE, N_DYNAMIC, N_JOINT,
                                          N_JOINT_ROW, ROWS_PER_CONTACT,
-                                         S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
+                                         S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_RECYCLE, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport rotate_to_body
 from lavender_ext.engine.narrow_phase cimport collide_bodies, manifold_t
 from lavender_ext.engine.projection cimport contact_normal_velocity
 from lavender_ext.core.vectors cimport linear_combination3, copy3, subtract3
+
+
+cdef enum:
+    EARLY = 4
 
 
 cdef inline uint64_t make_contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
@@ -328,9 +335,12 @@ cdef inline int32_t build_contacts(engine_t* e) noexcept nogil:
     return c
 
 
-cdef inline int32_t find_due_bodies(engine_t* e, int32_t shifted) noexcept nogil:
-    """Write the displacement of the bodies to e.shift after they have moved, and return whether a body is due, (5)."""
-    cdef int32_t i, k, b, any_due = 0
+cdef inline int32_t find_due_bodies(engine_t* e, int32_t shifted, int32_t ends) noexcept nogil:
+    """Write the displacement of the bodies to e.shift after they have moved, and return whether a body is due, (5).
+
+    `ends`: this was the last substep of a step.
+    """
+    cdef int32_t i, k, b, any_due = 0, n_due = 0
     cdef double h = e.setting[S_H], step, radius, limit
     cdef double* s
     cdef const double* size
@@ -348,13 +358,20 @@ cdef inline int32_t find_due_bodies(engine_t* e, int32_t shifted) noexcept nogil
             step += radius * sqrt(dot3(s + 3, s + 3))
         limit = min(0.5 * e.setting[S_MARGIN], 0.01 * radius)
         e.moved[b] += step
-        e.due[b] = not e.moved[b] + step <= limit
+        e.due[b] = not e.moved[b] + step <= limit or (ends and e.moved[b] > e.setting[S_RECYCLE])
+        any_due |= e.due[b]
     for i in range(2 * e.size[N_JOINT]):
         b = e.joint_bodies[i]
         if b >= 0 and e.kind_of_shape[b] != NO_SHAPE:
             e.due[b] = e.dyn[b] >= 0
-    for i in range(e.size[N_BODY]):
-        any_due |= e.due[i]
+            any_due |= e.due[b]
+    if ends:
+        for i in range(e.size[N_DYNAMIC]):
+            b = e.body_of[i]
+            if any_due and EARLY * e.moved[b] > e.setting[S_RECYCLE]:
+                e.due[b] = 1
+            n_due += e.due[b]
+        e.head[H_KEPT] = 2 * n_due <= e.size[N_DYNAMIC]
     return any_due
 
 

@@ -29,9 +29,9 @@ from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_
                                          H_ORDER, H_PHASE, H_POSITION_ITERATIONS, H_PROJECTED, H_REBUILT, H_SEED, H_SOLVED,
                                          H_STEP, H_SUBSTEPS, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_BODY, N_DYNAMIC,
                                          N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_BETA,
-                                         S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_OUT, S_SLOP, TOP_DOWN, bind_engine_arrays,
-                                         engine_t)
-from lavender_ext.engine.bodies cimport advance_bodies, begin_body_substep
+                                         S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_OUT, S_RECYCLE, S_SLOP, TOP_DOWN,
+                                         bind_engine_arrays, engine_t)
+from lavender_ext.engine.bodies cimport advance_bodies, are_contacts_new, begin_body_substep
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport (build_contacts, find_due_bodies, finish_contacts, follow_gaps, renew_contacts,
                                             store_contact_cache)
@@ -72,7 +72,7 @@ cdef inline int32_t prepare_contacts(engine_t* e, blocks_t* p, rows_t* r) noexce
     # joint rows, contacts
     if e.size[N_JOINT] > 0:
         build_joint_rows(e)
-    contacts = renew_contacts(e) if e.head[H_PHASE] > 0 else build_contacts(e)
+    contacts = build_contacts(e) if are_contacts_new(e) else renew_contacts(e)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
         return NEED_CAPACITY
@@ -234,7 +234,7 @@ cdef inline int32_t end_substep(engine_t* e) noexcept nogil:
 
 cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     """Write the statistics, project and advance the bodies, prepare the next substep's contacts; return OK or NOT_FINITE."""
-    cdef int32_t shifted, nonfinite_body, any_due
+    cdef int32_t shifted, nonfinite_body, any_due, ends
     store_statistics(e)
     # projection, integration
     nonfinite_body = find_nonfinite_body(e)
@@ -243,13 +243,13 @@ cdef int32_t finish_substep(engine_t* e) noexcept nogil:
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
     # gaps and cache for the next substep
-    if e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS]:
-        store_contact_cache(e)
-    else:
-        any_due = find_due_bodies(e, shifted)
+    ends = e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS]
+    any_due = 0
+    if not ends or e.setting[S_RECYCLE] > 0.0:
+        any_due = find_due_bodies(e, shifted, ends)
         follow_gaps(e)
-        if any_due:
-            store_contact_cache(e)
+    if ends or any_due:
+        store_contact_cache(e)
     return end_substep(e)
 
 
@@ -414,12 +414,13 @@ cdef inline void solve_in_lanes(engine_t* e, packs_t* packs, bint measures) noex
         measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
-cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs) noexcept nogil:
-    """Do what `finish_substep` does after `solve_in_lanes`, with the same bits."""
+cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs, bint last) noexcept nogil:
+    """Do what `finish_substep` does after `solve_in_lanes`, with the same bits; arrays that no substep reads only if `last`."""
     cdef contacts_t c = bind_contacts(e)
     cdef int finite
     cdef double depth = check_manifolds(&c, &packs.manifolds, &finite)
     cdef bint projects = depth > e.setting[S_SLOP] and e.head[H_POSITION_ITERATIONS] > 0
+    cdef bint ends = e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS], recycles = e.setting[S_RECYCLE] > 0.0
     cdef int32_t shifted = 0, nonfinite_body = -1, any_due = 0
     store_statistics(e)
     # projection, integration
@@ -437,15 +438,15 @@ cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs) noexcept nogil:
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
     # gaps and cache for the next substep
-    if e.head[H_PHASE] + 1 < e.head[H_SUBSTEPS]:
-        any_due = find_due_bodies(e, shifted)
+    if not ends or recycles:
+        any_due = find_due_bodies(e, shifted, ends)
         follow_manifolds(&c, &packs.manifolds, packs.lanes == 4, e.shift)
-        if any_due:
-            # Contacts that end here leave their rows in the arrays. The projection has used the first targets.
-            store_lanes(e, packs, True, e.head[H_CONTACTS] if projects else 0)
-            store_contact_cache(e)
-    else:
+    if any_due and not ends:
+        # Contacts that end here leave their rows in the arrays. The projection has used the first targets.
+        store_lanes(e, packs, True, e.head[H_CONTACTS] if projects else 0)
+    elif any_due or ends and (last or not recycles):
         store_lanes(e, packs, False, 0)
+    if any_due or ends and (last or not recycles):
         store_contact_cache(e)
     if e.head[H_LOST] >= 0:
         store_lanes(e, packs, not packs.stored, 0)
@@ -480,7 +481,7 @@ cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, packs_t* packs, 
                 store_lanes(e, packs, not packs.stored, 0)
         elif enter_lanes(e, &p, packs):
             solve_in_lanes(e, packs, last)
-            status = finish_in_lanes(e, packs)
+            status = finish_in_lanes(e, packs, last)
             done[0] += 1
         else:
             solve_packed_substep(e, &p, &r, packs, last)

@@ -18,7 +18,7 @@ import numpy as np
 
 from lavender.base.errors import InputError
 from lavender.problem.cones import get_block_kinds
-from lavender.sim.engine.layout import HEAD, SETTING, SIZE
+from lavender.sim.engine.layout import HEAD, ORDER_NUMBER, SETTING, SIZE
 from lavender.sim.engine.state import State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
@@ -116,6 +116,7 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) 
         **counters,
         **dict.fromkeys(("contacts", "matches", "cached"), (0, contacts)),
         **dict.fromkeys(("pairs_valid", "warm_start", "solved", "rebuilt"), (0, 1)),
+        "kept": (0, int(own.setting[SETTING["recycle"]] > 0.0 and new.head[HEAD["solved"]] == 1)),
         "phase": (0, 0),
         "contact_rows": (0, contacts * per),
         "pairs": (0, int(new.size[CAP_PAIR])),
@@ -166,6 +167,28 @@ def _check_contacts(new: State) -> None:
         b["contact_body"][:c], b["dyn"][pair]
     )
     require_intact(c == 0 or is_body, "contact_pair names bodies that the scene does not have")
+    if new.head[HEAD["kept"]]:
+        _check_kept_contacts(new, pair.astype(np.int64))
+
+
+def _check_kept_contacts(new: State, pair: np.ndarray) -> None:
+    """Check the contacts between the bodies `pair` (c, 2) that the next step keeps."""
+    b, c = new.a, len(pair)
+    is_body = np.array_equal(b["key"][:c] >> np.uint64(16), (pair[:, 0] << 24) | pair[:, 1])
+    require_intact(c == 0 or is_body, "key names other bodies than contact_pair")
+    own = pair[:, 0] * len(b["dyn"]) + pair[:, 1]
+    # From the last pair to the first if an alternating order began the step so; the number of substeps is even then.
+    alternates = new.head[HEAD["order"]] == ORDER_NUMBER["alternating"]
+    if alternates and new.head[HEAD["step"]] % 2:
+        own = own[::-1]
+    require_intact((own[1:] >= own[:-1]).all(), "contact_pair is not sorted")
+    for name in ("gap", "normal", "tangent", "arm_a", "arm_b", "local"):
+        require_intact(np.isfinite(b[name][:c]).all(), f"{name} is not finite")
+    rows = int(new.size[SIZE["joint_rows"]]), int(new.head[HEAD["contact_rows"]])
+    is_finite = np.isfinite(b["impulse"][rows[0] : sum(rows)]).all()
+    require_intact(is_finite, "impulse is not finite")
+    is_path = np.isfinite(b["moved"]).all() and (b["moved"] >= 0.0).all()
+    require_intact(is_path, "moved is no length")
 
 
 def require_intact(is_valid: Any, reason: str) -> None:

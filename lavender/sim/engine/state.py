@@ -217,6 +217,7 @@ def _put_parameters(state: State, p: Parameters) -> None:
         "bounce": p.restitution_threshold,
         "match": 5.0 * p.margin,
         "rolling": p.rolling_radius,
+        "recycle": p.recycle,
         "joint_give": JOINT_GIVE
         if p.solver != "sequential_impulses" and p.position_iterations
         else 0.0,

@@ -217,6 +217,8 @@ class Stepping:
         ]
         for first, x in values:
             self.state.a["v"][i, first : first + 3] = x
+        # The body may meet others that the contacts kept so far do not know.
+        self.state.head[HEAD["kept"]] = 0
 
     @run_exclusively
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:

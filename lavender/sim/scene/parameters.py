@@ -31,7 +31,7 @@ PARAMETER_RANGES: dict[str, dict[str, float]] = {
     "restitution": {"low": 0.0, "high": 1.0},
     **{
         key: {"low": 0.0}
-        for key in ("friction", "patch_radius", "rolling_radius", "slop", "margin")
+        for key in ("friction", "patch_radius", "rolling_radius", "slop", "margin", "recycle")
     },
     "restitution_threshold": {"low": 0.0},
 }
@@ -84,6 +84,9 @@ class Parameters:
         Depth that is not corrected.
     margin : float, m
         Gap below which contacts are created.
+    recycle : float, m
+        Contacts are kept over steps while no body of theirs has moved farther since they were built, along its path and
+        with its radius times its rotation; their gaps follow. At most half of `margin`; 0: built anew in every step.
     restitution_threshold : float, m/s
         Contacts with a smaller closing speed do not bounce.
     """
@@ -107,6 +110,7 @@ class Parameters:
     on_failure: str = "use"
     slop: float = 1e-3
     margin: float = 1e-2
+    recycle: float = 0.0
     restitution_threshold: float = 0.5
 
     def __post_init__(self) -> None:
@@ -115,6 +119,11 @@ class Parameters:
             put(self, name, check_float(name, getattr(self, name), **allowed))
         for name in ("friction", "patch_radius", "rolling_radius"):
             check_nonnegative_magnitudes(name, np.array([getattr(self, name)]))
+        if self.recycle > 0.5 * self.margin:
+            raise InputError(
+                f"recycle is {self.recycle:g} m; at most half of margin, {0.5 * self.margin:g} m, is possible, because "
+                "contacts are built only for gaps below margin"
+            )
         gravity: Any = self.gravity
         if get_shape("gravity", gravity) == ():
             size = check_float("gravity", gravity)
@@ -167,6 +176,11 @@ class Parameters:
             raise InputError(
                 f"order={self.order!r} is used only by sequential_impulses, and the solver is "
                 f"{self.solver!r}: leave order out, or give solver_options of {self.solver!r}"
+            )
+        if self.recycle > 0.0 and self.order == "alternating" and self.substeps % 2:
+            raise InputError(
+                f"recycle is {self.recycle:g} m, and a step has {self.substeps} substeps; the order 'alternating' "
+                "needs an even number, so that all steps begin with the same order: give substeps, or order='given'"
             )
         check_name("friction_shape", self.friction_shape, SHAPES)
         put(

@@ -217,6 +217,7 @@ export class Simulation {
       throw new Error("the number of a body that is not static, and six numbers are needed");
     }
     this.array("v").set(velocity, 6 * body);
+    this.array("head")[this.k.layout.head.kept] = 0;
   }
 
   // Return the eight values of SOLVER_FIELDS.
