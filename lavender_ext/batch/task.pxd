@@ -6,7 +6,7 @@ violates its target, or if the estimated cost is above the limit.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, fabs
-from libc.string cimport memcpy
+from libc.string cimport memcmp, memcpy
 
 from lavender_ext.core.arena cimport arena_t, has_memory, make_arena, take_doubles, take_integers
 from lavender_ext.core.assemble cimport lav_form_delassus_matrix, lav_list_blocks_of_bodies
@@ -27,7 +27,7 @@ from lavender_ext.small.call cimport (are_all_rows_bounded, can_use_small_call, 
 from lavender_ext.small.limits cimport (estimate_newton_cost_terms, limits_t, max_factorisation_work,
                                         max_newton_cost, newton_cost_t)
 from lavender_ext.small.task cimport (BOUND, COUNT_EVALUATIONS, COUNT_FACTORISATIONS, COUNT_ITERATIONS,
-                                      COUNT_ROUNDS, FORMED, ISLANDS, LANE_START, NUMBERS, RESULT_FAILED,
+                                      COUNT_ROUNDS, FORMED, GIVEN_START, ISLANDS, NUMBERS, RESULT_FAILED,
                                       RESULT_IS_START, RESULT_SOLVED, WORK,
                                       count_task_scratch, grow_workspace_to_arena, small_rules_t, task_t)
 from lavender_ext.batch.lanes cimport is_solved_in_one_lane, solve_in_one_lane
@@ -149,18 +149,20 @@ cdef inline int32_t solve_generalized_task(task_t* j, workspace_t* workspaces, c
     cdef newton_cost_t cost
     cdef bint soft, is_late
     cdef int32_t code
+    cdef size_t size = p.n_rows * sizeof(double)
     cdef double* start
+    if not grow_workspace_to(&workspaces[GIVEN_START], 0, 2 * <int64_t>p.n_rows):
+        return RESULT_FAILED
+    start = workspaces[GIVEN_START].real
+    memcpy(start, j.lam, size)
     if limits.lanes != 0.0 and not j.failed_in_lanes and j.made.n_empty == 0 \
-            and is_solved_in_one_lane(p, &j.g, j.zero_residual) \
-            and grow_workspace_to(&workspaces[LANE_START], 0, p.n_rows):
-        start = workspaces[LANE_START].real
-        memcpy(start, j.lam, p.n_rows * sizeof(double))
+            and is_solved_in_one_lane(p, &j.g, j.zero_residual):
         if solve_in_one_lane(p, &j.g, j.zero_residual, j.tol, not j.cold, workspace, j.lam, j.counts) \
                 and grow_workspace_to(workspace, 0, count_task_scratch(j)):
             judge_task(j, workspace.real)
             if j.solved:
                 return RESULT_SOLVED
-        memcpy(j.lam, start, p.n_rows * sizeof(double))
+        memcpy(j.lam, start, size)
     # cost limits, workspace
     soft = needs_no_proximal_terms(p, &j.g)
     cost = estimate_newton_cost_terms(p, &j.g, limits)
@@ -190,6 +192,14 @@ cdef inline int32_t solve_generalized_task(task_t* j, workspace_t* workspaces, c
     is_late = has_passed(j.deadline, 0.0)
     if (code != REACHED and not is_late) or not grow_workspace_to(workspace, 0, count_task_scratch(j) + p.n_rows):
         return RESULT_FAILED
+    if code == REACHED and info.work == 0 and not j.cold and memcmp(j.lam, start, size):
+        # Scaling has rounded a start that may be a solution within its bounds: return it if it is one.
+        memcpy(start + p.n_rows, j.lam, size)
+        memcpy(j.lam, start, size)
+        judge_task_within_bounds(j, workspace.real)
+        if j.solved:
+            return RESULT_SOLVED
+        memcpy(j.lam, start + p.n_rows, size)
     judge_task_within_bounds(j, workspace.real)
     return RESULT_SOLVED if j.solved or is_late else RESULT_FAILED
 

@@ -35,7 +35,7 @@ cdef enum:                      # workspaces of one thread
     NUMBERS = 3                 # A, d, nu and step
     FORMED = 4                  # A of bodies
     BOUND = 5                   # workspace of `derive_small_problem`
-    LANE_START = 5              # of J and M: start of a lane, for the method that follows if the lane fails
+    GIVEN_START = 5             # of J and M: the given start and the result, if the start may be returned instead
     N_CALL_WORKSPACES = 6
 
 

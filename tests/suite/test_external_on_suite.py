@@ -32,13 +32,17 @@ def test_impulse_form_with_singular_a_is_solved_with_a_shift_that_the_message_na
     assert "1e-07 was added to the diagonal of the singular P" in solution.message
 
 
+def refuse_call(*_):
+    pytest.fail("the backend is set up after the deadline")
+
+
 @pytest.mark.parametrize("name", BACKENDS)
 def test_backend_under_a_limit_below_its_set_up_is_not_called(name, monkeypatch):
     """The deadline has passed before the set-up, and the start is judged."""
     problem = suite.case("granular(n=6)").problem
     lv.residual(problem, problem.start())
     with monkeypatch.context() as patch:
-        patch.setattr(qp_solver.QPSolver, "prepare", None)
+        patch.setattr(qp_solver.QPSolver, "prepare", refuse_call)
         late = lv.solve(problem, name, time_limit=1e-9)
     assert late.status is lv.Status.TIME_LIMIT and "time limit" in late.message
     assert not late.work
