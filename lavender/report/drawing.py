@@ -161,7 +161,7 @@ def draw_figure(
 
 def _adapt_svg(svg: str, name: str, description: str) -> str:
     """Make an SVG part of a page: its theme and fonts, two decimals, no metadata, and ids that no other figure has."""
-    unused = r"<metadata>.*?</metadata>|<!--.*?-->|\n\s*(?=<)"
+    unused = r"<metadata>.*?</metadata>|<!--.*?-->|\n\s*(?=<)| transform=\"rotate\(-0 [^\"]*\"|<g/>"
     svg = re.sub(unused, "", svg[svg.index("<svg") :], flags=re.DOTALL)
     for color, variable in THEME.items():
         svg = svg.replace(color, variable)
@@ -172,15 +172,19 @@ def _adapt_svg(svg: str, name: str, description: str) -> str:
     used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
 
     def adapt_tag(match: re.Match[str]) -> str:
-        """Round the numbers of a tag and replace its ids and font."""
+        """Round the numbers of a tag, replace its ids, shorten its style, and leave the font to the figure."""
         tag = re.sub(r"(\d\.\d\d)\d+", r"\1", match[0])
-        font = r"font: \1px system-ui,'DejaVu Sans',sans-serif"
-        tag = re.sub(r"font: ([\d.]+)px '?DejaVu Sans'?[^;\"]*", font, tag)
+        tag = re.sub(r"font: ([\d.]+)px '?DejaVu Sans'?[^;\"]*", r"font-size: \1px", tag)
+        tag = re.sub(r"font-family: [^;\"]*;? ?", "", tag)
+        tag = re.sub(r'(?<= style=")[^"]*', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), tag)
         tag = re.sub(r' id="([^"]+)"', lambda m: f' id="{ids[m[1]]}"' if m[1] in used else "", tag)
         return re.sub(r'(url\(#|href="#)([^)"]+)', lambda m: m[1] + ids.get(m[2], m[2]), tag)
 
     svg = re.sub(r"<[^>]+>", adapt_tag, svg)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)
+    font = "font-family:system-ui,'DejaVu Sans',sans-serif"
+    return svg.replace(
+        "<svg ", f'<svg role="img" style="{font}" aria-label="{escape(description)}" ', 1
+    )
 
 
 def spread_labels(values: Sequence[float], gap: float, low: float, high: float) -> FloatArray:

@@ -245,15 +245,14 @@ def test_comparison_of_models_names_the_values_that_a_converter_lost(capsys):
 
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # of osqp
 def test_backends_leave_the_path_of_an_arm_alone_and_keep_it_through_lavender(drawn):
-    """The figures of quadratic-programs.md; backends alone differ between versions, by less than a factor of two."""
+    """The bounds of quadratic-programs.md; how far a backend alone goes depends on version and machine."""
     pytest.importorskip("quadprog")
     found = drawn("inverse_kinematics").numbers()
     page = (DOCS / "quadratic-programs.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"leaves quadprog's path by .*?`lavender.qp.solve_qp`", page, re.DOTALL)
-    osqp, others, through = (float(number) for number in re.findall(r"([\d.e-]+) rad", text))
+    alone, through = (float(number) for number in re.findall(r"([\d.e-]+) rad", text))
     for name, distances in found.items():
-        told = osqp if name == "osqp" else others
-        assert 0.5 * told < distances["alone"].max() < 2.0 * told, name
+        assert distances["alone"].max() > alone, name
         assert distances["lavender"].max() < through, name
 
 
