@@ -58,6 +58,8 @@ SHOWN_RATIO = (
 TREND_RATIO = (
     2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
 )
+# Errors up to this part of the limit are roundings, whose trend says nothing.
+ROUNDING_SHARE = 1e-6
 MIN_TREND_SHARE = 0.05  # Share of the steps that has to exceed it; fewer are isolated spikes.
 MAX_NAMED_ROWS = 8  # Rows of the table of rows.
 FORCES_NOTE = (
@@ -317,6 +319,8 @@ class AuditCounts:
         if not all(map(len, known)):
             return text
         early, late = (float(np.quantile(part, 0.99, method="higher")) for part in known)
+        if max(early, late) < ROUNDING_SHARE * self.limit:
+            return text
         # Isolated spikes are no trend: a share of the steps has to exceed the other part's quantile by the factor.
         shares = [
             float(np.mean(part > TREND_RATIO * other))

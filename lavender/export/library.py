@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.export.amalgamate import ExtractionError, amalgamate, hash_sources
-from lavender.io.stored import check_writable, load_or_make_file, make_folder, write_bytes
+from lavender.io.stored import as_path, check_writable, load_or_make_file, make_folder, write_bytes
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
@@ -43,12 +44,12 @@ def source() -> str:
     ).decode()
 
 
-def write(out: Path, *, replace: bool = False) -> list[Path]:
+def write(out: str | os.PathLike[str], *, replace: bool = False) -> list[Path]:
     """Write the C library into a folder.
 
     Parameters
     ----------
-    out : Path
+    out : path
         Folder, which is created if it does not exist. Files with other names in it are kept.
     replace : bool
         Whether to replace existing files with other contents.
@@ -65,6 +66,7 @@ def write(out: Path, *, replace: bool = False) -> list[Path]:
     LavenderError
         `source` raises it.
     """
+    out = as_path(out)
     check_writable(out, folder=True)
     folder = HERE / "c"
     contents = {

@@ -109,7 +109,7 @@ def test_checksums_are_of_the_files(folder):
 def test_export_does_not_replace_other_files(tmp_path, folder):
     (tmp_path / "lavender.h").write_text("mine")
     with pytest.raises(LavenderError, match="--replace"):
-        export.write(tmp_path)
+        export.write(str(tmp_path))
     assert [p.name for p in tmp_path.iterdir()] == ["lavender.h"]
 
 
