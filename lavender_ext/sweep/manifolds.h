@@ -60,6 +60,7 @@ typedef struct {
     char* groups;
     lavender_rows* rows;
     double *x, *v, *free, *before;      /* (contacts + 1, 8) as `relax` tells; (bodies + 2, 8) velocities */
+    lavender_four* own;                 /* (rows, 8) the same in lanes, or NULL: groups of several sweeps share a contact */
     double *d, *inverse;                /* (contacts + 1, 2) 1/kg; (bodies + 1, 12) inverse inertia */
     void* place[9];                     /* allocated memory, and its sizes in bytes */
     size_t size[9];
@@ -150,7 +151,8 @@ static int lavender_has_avx2(void) { return 0; }
 #endif
 
 /* Write manifold `first` .. `first` + `count` of the order to a lane of a group, without its rows. */
-static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_t count, lavender_group* g, int lane) {
+static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_t count, lavender_group* g, lavender_four* own,
+                               int lane) {
     const int32_t i = c->order[first], *body = c->body + 2 * i;
     const double *n = c->normal + 3 * i, *t = c->tangent + 3 * i;
     double* axis = (double*)g->axis + lane;
@@ -182,6 +184,10 @@ static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_
             p[4 * q] = c->arm_a[3 * at + q];
             p[4 * (3 + q)] = c->arm_b[3 * at + q];
         }
+        if (!own) continue;
+        p = (double*)(own + 8 * j) + lane;
+        for (int q = 0; q < 3; q++) p[4 * q] = c->impulse[3 * at + q];
+        p[4 * 3] = c->gap[at];
     }
 }
 
@@ -220,7 +226,7 @@ static lavender_group* lavender_open_group(const lavender_contacts* c, char* pla
 }
 
 /* Close a group, and return its size in bytes. Points that a lane does not have are zero and belong to contact n. */
-static size_t lavender_close_group(const lavender_contacts* c, lavender_group* g, lavender_rows* rows) {
+static size_t lavender_close_group(const lavender_contacts* c, lavender_group* g, lavender_rows* rows, lavender_four* own) {
     for (int lane = 0; lane < 4; lane++) {
         if (g->count[lane] > g->n) g->n = g->count[lane];
         if (g->count[lane] && g->count[lane] < g->n_all) g->n_all = g->count[lane];
@@ -230,6 +236,7 @@ static size_t lavender_close_group(const lavender_contacts* c, lavender_group* g
             double* p = (double*)(g->point + j) + lane;
             for (int q = 0; q < 6; q++) p[4 * q] = 0.0;
             for (int q = 0; q < 22; q++) ((double*)(rows + j))[4 * q + lane] = 0.0;
+            for (int q = 0; q < 8 && own; q++) ((double*)(own + 8 * j))[4 * q + lane] = 0.0;
             g->contact[j][lane] = 8 * c->n;
         }
     return sizeof *g + (size_t)g->n * sizeof *g->point;
@@ -319,7 +326,9 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     const size_t every = (size_t)m->n_groups + (m->n_sweeps > 1 ? (size_t)m->n_once : 0);
     m->start = (size_t*)lavender_reserve(m, 2, sizeof(size_t) * every);
     m->groups = (char*)lavender_reserve(m, 3, most * every);
-    m->x = (double*)lavender_reserve(m, 4, 8 * 8 * (n + 1));
+    m->own = NULL;
+    const int has_own = m->n_sweeps == 1 && m->along;
+    m->x = (double*)lavender_reserve(m, 4, has_own ? 4 * every * 8 * sizeof(lavender_four) : 8 * 8 * (n + 1));
     m->v = (double*)lavender_reserve(m, 5, 3 * 8 * 8 * (n_bodies + 2));
     m->d = (double*)lavender_reserve(m, 6, 8 * 2 * (n + 1));
     m->inverse = (double*)lavender_reserve(m, 7, 8 * 12 * (n_bodies + 1));
@@ -334,8 +343,9 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
         m->inverse[12 * i + 9] = m->inverse[12 * i + 10] = m->inverse[12 * i + 11] = 0.0;
     }
     memset(m->inverse + 12 * n_bodies, 0, 8 * 12);
-    memset(m->x + 8 * n, 0, 8 * 8);
-    for (size_t i = 0; i < n; i++) {
+    if (has_own) m->own = (lavender_four*)m->x;
+    else memset(m->x + 8 * n, 0, 8 * 8);
+    for (size_t i = 0; i < n && !has_own; i++) {
         for (int k = 0; k < 3; k++) m->x[8 * i + (size_t)k] = c->impulse[3 * i + (size_t)k];
         m->x[8 * i + 3] = c->gap[i];
     }
@@ -349,13 +359,14 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     int32_t row = 0;
     for (int32_t k = 0, i = 0; k < m->n_once; k++) {
         lavender_group* g = lavender_open_group(c, m->groups + bytes, row);
+        lavender_four* own = m->own ? m->own + 8 * (size_t)row : NULL;
         const int32_t stop = m->n_sweeps == 1 ? used[k] : (i + 4 < count ? i + 4 : count);
         for (int lane = 0; i < stop; lane++, i++) {
             const int32_t at = m->n_sweeps == 1 ? sorted[i] : i;
-            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, lane);
+            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, own, lane);
         }
         m->start_once[k] = bytes;
-        bytes += lavender_close_group(c, g, m->rows + row);
+        bytes += lavender_close_group(c, g, m->rows + row, own);
         row += g->n;
     }
     lavender_run_groups(wide, m, LAVENDER_ROWS, 0, NULL, NULL, NULL);
@@ -368,7 +379,7 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
             lavender_copy_rows(m->rows + from->first_row, sorted[i] % 4, m->rows + row, lane, g->count[lane]);
         }
         m->start[k] = bytes;
-        bytes += lavender_close_group(c, g, m->rows + row);
+        bytes += lavender_close_group(c, g, m->rows + row, NULL);
         row += g->n;
     }
     return 1;
@@ -437,7 +448,17 @@ static void lavender_follow_manifolds(const lavender_contacts* c, lavender_manif
 /* Return the largest -gap [m], at least 0; finite: whether all gaps and impulses are finite. */
 static double lavender_check_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int* finite) {
     double depth = 0.0, bad[4] = {0.0, 0.0, 0.0, 0.0};
-    for (size_t i = 0; i < (size_t)c->n; i++) {
+    for (int32_t k = 0; k < m->n_once && m->own; k++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[k]);
+        for (int j = 0; j < g->n; j++)
+            for (int lane = 0; lane < 4; lane++) {
+                const double* p = (const double*)(m->own + 8 * ((size_t)g->first_row + (size_t)j)) + lane;
+                if (j >= g->count[lane]) continue;
+                for (int q = 0; q < 4; q++) bad[q] += 0.0 * p[4 * q];
+                if (-p[4 * 3] > depth) depth = -p[4 * 3];
+            }
+    }
+    for (size_t i = 0; i < (size_t)c->n && !m->own; i++) {
         const double* x = m->x + 8 * i;
         for (int k = 0; k < 4; k++) bad[k] += 0.0 * x[k];
         if (-x[3] > depth) depth = -x[3];
@@ -449,22 +470,21 @@ static double lavender_check_manifolds(const lavender_contacts* c, const lavende
 /* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them, and the targets of rows
  * from first_target on. */
 static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows, int32_t first_target) {
-    for (size_t i = 0; i < (size_t)c->n; i++) {
-        const double* x = m->x + 8 * i;
-        for (size_t k = 0; k < 3; k++) c->impulse[3 * i + k] = x[k];
-        c->gap[i] = x[3];
-        for (size_t k = 0; k < 3 && rows; k++) {
-            c->b[3 * i + k] = 0.0 - x[4 + k];
-            if (3 * i + k >= (size_t)first_target) c->target[3 * i + k] = k ? 0.0 : x[7];
-            c->d[3 * i + k] = m->d[2 * i + (k > 0)];
-        }
-    }
-    for (int32_t k = 0; k < m->n_once && rows; k++) {
+    for (int32_t k = 0; k < m->n_once; k++) {
         const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[k]);
         for (int lane = 0; lane < 4; lane++)
             for (int j = 0; j < g->count[lane]; j++) {
-                const size_t i = (size_t)g->contact[j][lane] / 8;
-                const double* p = (const double*)(m->rows + g->first_row + j) + lane;
+                const size_t at = (size_t)g->first_row + (size_t)j, i = (size_t)g->contact[j][lane] / 8, next = m->own ? 4 : 1;
+                const double* x = m->own ? (const double*)(m->own + 8 * at) + lane : m->x + 8 * i;
+                const double* p = (const double*)(m->rows + at) + lane;
+                for (size_t q = 0; q < 3; q++) c->impulse[3 * i + q] = x[next * q];
+                c->gap[i] = x[next * 3];
+                if (!rows) continue;
+                for (size_t q = 0; q < 3; q++) {
+                    c->b[3 * i + q] = 0.0 - x[next * (4 + q)];
+                    if (3 * i + q >= (size_t)first_target) c->target[3 * i + q] = q ? 0.0 : x[next * 7];
+                    c->d[3 * i + q] = m->d[2 * i + (q > 0)];
+                }
                 c->step[3 * i] = p[4 * 0];
                 c->step[3 * i + 1] = c->step[3 * i + 2] = p[4 * 1];
                 for (size_t q = 0; q < 5; q++) c->coupling[5 * i + q] = q < 2 ? p[4 * (2 + q)] : 0.0;

@@ -91,7 +91,7 @@ ISA static void FOUR(rows)(const lavender_group* g, lavender_rows* rows, const d
 }
 
 /* Let the gaps follow the displacement of the bodies, (5) of engine/contacts.pxd. */
-ISA static void FOUR(follow)(const lavender_group* g, const double* shift, double* x) {
+ISA static void FOUR(follow)(const lavender_group* g, const double* shift, double* x, lavender_four* own) {
     lavender_four sa[6], sb[6], u[3];
     FOUR(load_bodies)(shift, g->read_a, sa);
     FOUR(load_bodies)(shift, g->read_b, sb);
@@ -99,6 +99,10 @@ ISA static void FOUR(follow)(const lavender_group* g, const double* shift, doubl
         const int32_t* at = g->contact[j];
         FOUR(relative_velocity)(g->point + j, sa, sb, u);
         const lavender_four closing = LAVENDER_DOT_FOUR(g->axis, u);
+        if (own) {
+            own[8 * j + 3] = own[8 * j + 3] + closing;
+            continue;
+        }
         for (int lane = 0; lane < 4; lane++) x[at[lane] + 3] += closing[lane];
     }
 }
@@ -106,7 +110,7 @@ ISA static void FOUR(follow)(const lavender_group* g, const double* shift, doubl
 /* Right-hand sides for the velocities `free`, the gaps and the impulses: (1) to (4) of engine/contacts.pxd. With f, also add
  * J^T lam to the wrenches f of the bodies: `add_contact_wrench` of core/velocity.pxd. */
 ISA static void FOUR(refresh)(const lavender_group* g, const lavender_targets* t, int backwards, const double* free,
-                              const double* before, double* x, double* f) {
+                              const double* before, double* x, lavender_four* own, double* f) {
     const lavender_four zero = {0.0, 0.0, 0.0, 0.0}, h = zero + t->h;
     lavender_four va[6], vb[6], ua[6], ub[6], fa[6], fb[6], old_a[6], old_b[6];
     FOUR(load_bodies)(free, g->read_a, va);
@@ -125,8 +129,13 @@ ISA static void FOUR(refresh)(const lavender_group* g, const lavender_targets* t
         const int32_t* at = g->contact[k];
         double *x0 = x + at[0], *x1 = x + at[1], *x2 = x + at[2], *x3 = x + at[3];
         lavender_four lam[4], u[3], out[4], b, force[3], l[3];
-        if (!t->warm) x0[0] = x1[0] = x2[0] = x3[0] = x0[1] = x1[1] = x2[1] = x3[1] = x0[2] = x1[2] = x2[2] = x3[2] = 0.0;
-        LOAD_FOUR(x0, x1, x2, x3, lam);
+        if (own) {
+            if (!t->warm) own[8 * k] = own[8 * k + 1] = own[8 * k + 2] = zero;
+            for (int i = 0; i < 4; i++) lam[i] = own[8 * k + i];
+        } else {
+            if (!t->warm) x0[0] = x1[0] = x2[0] = x3[0] = x0[1] = x1[1] = x2[1] = x3[1] = x0[2] = x1[2] = x2[2] = x3[2] = 0.0;
+            LOAD_FOUR(x0, x1, x2, x3, lam);
+        }
         FOUR(relative_velocity)(p, va, vb, u);
         lavender_four gap = lam[3];
         const lavender_four_bits open = gap > zero;
@@ -144,7 +153,8 @@ ISA static void FOUR(refresh)(const lavender_group* g, const lavender_targets* t
         out[1] = zero - (zero - LAVENDER_DOT_FOUR(g->axis + 3, u));
         out[2] = zero - (zero - LAVENDER_DOT_FOUR(g->axis + 6, u));
         out[3] = target;
-        STORE_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, out);
+        if (own) for (int i = 0; i < 4; i++) own[8 * k + 4 + i] = out[i];
+        else STORE_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, out);
         if (!f) continue;
         for (int i = 0; i < 6; i++) {
             old_a[i] = fa[i];
@@ -175,14 +185,22 @@ ISA static void FOUR(refresh)(const lavender_group* g, const lavender_targets* t
 }
 
 /* Update point p of each lane: `relax_contact` of core/contact.pxd for two tangents in a disk and no compliance. At x + its
- * offset a contact has its impulses (3), gap, negative right-hand sides (3) and target. */
-ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavender_point* p, const lavender_rows* r, const int32_t* at, double* x,
-                                          lavender_four* va, lavender_four* vb) {
+ * offset, or without x in own, a contact has its impulses (3), gap, negative right-hand sides (3) and target. */
+ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavender_point* p, const lavender_rows* r,
+                                          const int32_t* at, double* x, lavender_four* own, lavender_four* va,
+                                          lavender_four* vb) {
     const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
-    double *x0 = x + at[0], *x1 = x + at[1], *x2 = x + at[2], *x3 = x + at[3];
+    double *x0 = x + (x ? at[0] : 0), *x1 = x + (x ? at[1] : 0), *x2 = x + (x ? at[2] : 0), *x3 = x + (x ? at[3] : 0);
     lavender_four lam[4], minus_b[4], u[3], impulse[3], change[3];
-    LOAD_FOUR(x0, x1, x2, x3, lam);
-    LOAD_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, minus_b);
+    if (x) {
+        LOAD_FOUR(x0, x1, x2, x3, lam);
+        LOAD_FOUR(x0 + 4, x1 + 4, x2 + 4, x3 + 4, minus_b);
+    } else {
+        for (int k = 0; k < 3; k++) {
+            lam[k] = own[k];
+            minus_b[k] = own[4 + k];
+        }
+    }
     FOUR(relative_velocity)(p, va, vb, u);
     /* normal */
     lavender_four slack = LAVENDER_DOT_FOUR(g->axis, u) + minus_b[0];
@@ -211,7 +229,8 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
     lam[0] = normal;
     lam[1] = first;
     lam[2] = second;
-    STORE_FOUR(x0, x1, x2, x3, lam);
+    if (x) STORE_FOUR(x0, x1, x2, x3, lam);
+    else for (int k = 0; k < 3; k++) own[k] = lam[k];
     for (int k = 0; k < 3; k++) impulse[k] = (impulse[k] + change[1] * g->axis[3 + k]) + change[2] * g->axis[6 + k];
     /* velocities of both bodies */
     for (int k = 0; k < 3; k++) {
@@ -225,21 +244,21 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
 
 /* Update all manifolds of a group. A point that not every lane has changes only the lanes that have it. */
 ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, const lavender_rows* rows, int backwards, double* x,
-                                                double* v) {
+                                                lavender_four* own, double* v) {
     lavender_four va[6], vb[6], old_a[6], old_b[6];
     FOUR(load_bodies)(v, g->read_a, va);
     FOUR(load_bodies)(v, g->read_b, vb);
     for (int j = 0; j < g->n; j++) {
         const int k = backwards ? g->n - 1 - j : j;
         if (k < g->n_all) {
-            FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, va, vb);
+            FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, own + 8 * k, va, vb);
             continue;
         }
         for (int i = 0; i < 6; i++) {
             old_a[i] = va[i];
             old_b[i] = vb[i];
         }
-        FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, va, vb);
+        FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, own + 8 * k, va, vb);
         const lavender_four_bits has = LAVENDER_HAS_POINT(g, k);
         for (int i = 0; i < 6; i++) {
             va[i] = LAVENDER_PICK_FOUR(has, va[i], old_a[i]);
@@ -250,17 +269,35 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, const l
     FOUR(store_bodies)(v, g->write_b, vb);
 }
 
-/* One pass over all groups; `t` and `before` are for LAVENDER_REFRESH, and `f` receives the wrenches. */
+/* A sweep, or several, over all groups; two functions, so that the compiler sees which of x and own there is. */
+ISA static __attribute__((noinline)) void FOUR(sweep)(const lavender_manifolds* m, int backwards) {
+    for (int i = 0; i < m->n_groups; i++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + m->start[backwards ? m->n_groups - 1 - i : i]);
+        FOUR(relax_group)(g, m->rows + g->first_row, backwards, m->x, NULL, m->v);
+    }
+}
+
+ISA static __attribute__((noinline)) void FOUR(sweep_own)(const lavender_manifolds* m, int backwards) {
+    for (int i = 0; i < m->n_groups; i++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + m->start[backwards ? m->n_groups - 1 - i : i]);
+        FOUR(relax_group)(g, m->rows + g->first_row, backwards, NULL, m->own + 8 * (size_t)g->first_row, m->v);
+    }
+}
+
+/* One pass; `t` and `before` are for LAVENDER_REFRESH, and `f` receives the wrenches. */
 ISA static void FOUR(run)(const lavender_manifolds* m, int what, int backwards, const lavender_targets* t, const double* before,
                           double* f) {
-    const int of_sweep = what == LAVENDER_SWEEP, n = of_sweep ? m->n_groups : m->n_once;
-    const size_t* start = of_sweep ? m->start : m->start_once;
-    for (int i = 0; i < n; i++) {
-        const lavender_group* g = (const lavender_group*)(m->groups + start[backwards ? n - 1 - i : i]);
-        if (what == LAVENDER_SWEEP) FOUR(relax_group)(g, m->rows + g->first_row, backwards, m->x, m->v);
-        else if (what == LAVENDER_ROWS) FOUR(rows)(g, m->rows + g->first_row, m->inverse, m->d);
-        else if (what == LAVENDER_REFRESH) FOUR(refresh)(g, t, backwards, m->free, before, m->x, f);
-        else FOUR(follow)(g, m->free, m->x);
+    if (what == LAVENDER_SWEEP) {
+        if (m->own) FOUR(sweep_own)(m, backwards);
+        else FOUR(sweep)(m, backwards);
+        return;
+    }
+    for (int i = 0; i < m->n_once; i++) {
+        const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[backwards ? m->n_once - 1 - i : i]);
+        lavender_four* own = m->own ? m->own + 8 * (size_t)g->first_row : NULL;
+        if (what == LAVENDER_ROWS) FOUR(rows)(g, m->rows + g->first_row, m->inverse, m->d);
+        else if (what == LAVENDER_REFRESH) FOUR(refresh)(g, t, backwards, m->free, before, m->x, own, f);
+        else FOUR(follow)(g, m->free, m->x, own);
     }
 }
 
