@@ -191,25 +191,20 @@ static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_
     }
 }
 
-/* Copy a lane of a group to a lane of another one. */
+/* Copy what a lane of a group has besides vectors to a lane of another one. */
 static void lavender_copy_lane(const lavender_group* from, int i, lavender_group* to, int k) {
-    const int count = from->count[i];
     to->read_a[k] = from->read_a[i];
     to->read_b[k] = from->read_b[i];
     to->write_a[k] = from->write_a[i];
     to->write_b[k] = from->write_b[i];
-    to->count[k] = count;
-    for (int j = 0; j < count; j++) to->contact[j][k] = from->contact[j][i];
-    const double* x = (const double*)from->axis + i;
-    double* y = (double*)to->axis + k;
-    for (size_t q = 0; q < 13 + 6 * (size_t)count; q++) y[4 * q] = x[4 * q];
+    to->count[k] = from->count[i];
+    for (int j = 0; j < 4; j++) to->contact[j][k] = from->contact[j][i];
 }
 
-/* Copy the rows of a lane to a lane of another group. */
-static void lavender_copy_rows(const lavender_rows* from, int i, lavender_rows* to, int k, int count) {
-    const double* x = (const double*)from + i;
-    double* y = (double*)to + k;
-    for (size_t q = 0; q < 22 * (size_t)count; q++) y[4 * q] = x[4 * q];
+/* Write n vectors whose lanes begin at the four places. */
+static void lavender_copy_vectors(const double* const* from, lavender_four* to, int n) {
+    const double *a = from[0], *b = from[1], *c = from[2], *d = from[3];
+    for (size_t q = 0; q < (size_t)n; q++) to[q] = (lavender_four){a[4 * q], b[4 * q], c[4 * q], d[4 * q]};
 }
 
 /* Open a group: all lanes are empty. An empty lane reads zeros, and nothing reads what it writes. */
@@ -235,7 +230,7 @@ static size_t lavender_close_group(const lavender_contacts* c, lavender_group* g
         for (int j = g->count[lane]; j < g->n; j++) {
             double* p = (double*)(g->point + j) + lane;
             for (int q = 0; q < 6; q++) p[4 * q] = 0.0;
-            for (int q = 0; q < 22; q++) ((double*)(rows + j))[4 * q + lane] = 0.0;
+            rows[j].step[0][lane] = rows[j].step[1][lane] = 0.0;    /* The impulse stays 0. */
             for (int q = 0; q < 8 && own; q++) ((double*)(own + 8 * j))[4 * q + lane] = 0.0;
             g->contact[j][lane] = 8 * c->n;
         }
@@ -373,11 +368,20 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     /* groups of several sweeps */
     for (int32_t k = 0, i = 0; k < m->n_groups && m->n_sweeps > 1; k++) {
         lavender_group* g = lavender_open_group(c, m->groups + bytes, row);
-        for (int lane = 0; i < used[k]; lane++, i++) {
-            const lavender_group* from = (const lavender_group*)(m->groups + m->start_once[sorted[i] / 4]);
-            lavender_copy_lane(from, sorted[i] % 4, g, lane);
-            lavender_copy_rows(m->rows + from->first_row, sorted[i] % 4, m->rows + row, lane, g->count[lane]);
+        const double *vectors[4], *rows[4];
+        int points = 0;
+        for (int lane = 0; lane < 4; lane++) {
+            const int32_t at = sorted[i < used[k] ? i : i - 1];     /* An empty lane has the numbers of the one before it. */
+            const lavender_group* from = (const lavender_group*)(m->groups + m->start_once[at / 4]);
+            vectors[lane] = (const double*)from->axis + at % 4;
+            rows[lane] = (const double*)(m->rows + from->first_row) + at % 4;
+            if (i == used[k]) continue;
+            lavender_copy_lane(from, at % 4, g, lane);
+            if (g->count[lane] > points) points = g->count[lane];
+            i++;
         }
+        lavender_copy_vectors(vectors, g->axis, 13 + 6 * points);
+        lavender_copy_vectors(rows, (lavender_four*)(m->rows + row), 22 * points);
         m->start[k] = bytes;
         bytes += lavender_close_group(c, g, m->rows + row, NULL);
         row += g->n;
