@@ -31,6 +31,7 @@ from lavender.base.errors import InputError
 from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.data import convert_keys
+from lavender.problem.engine_record import EngineRecord
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.carry import carry_impulses_of_worlds
@@ -463,7 +464,7 @@ class Batch(Sequence[Problem]):
             key=self._get_keys_of_world(i) if named else None,
         )
         if i in self.engine_motions:
-            problem.__dict__["engine_motion"] = self.engine_motions[i]
+            problem.set_record(EngineRecord(self.engine_motions[i]))
         return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:

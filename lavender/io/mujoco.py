@@ -45,6 +45,7 @@ from lavender.io.rest import count_tiny_as_zero
 from lavender.io.stiff_rows import MAX_EXAMINED_COMPLIANCE, raise_compliance
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
+from lavender.problem.engine_record import EngineRecord, EngineSource
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
 from lavender_ext.core.checks import max_abs_of_array
@@ -146,8 +147,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         raised = raise_compliance(problem) if is_stiff else None
         if raised is not None:
             problem = replace(problem, compliance=raised)
-    is_stepped = before is not None
-    problem.__dict__["engine_step"] = weakref.ref(data), model, np.array(data.qvel), is_stepped
+    is_stepped, answer = before is not None, None
     if step.m and not step.has_noslip:
         # Copies of what the step overwrites; the motion is made when it is judged.
         arrays = data.efc_force.copy(), data.qacc.copy(), data.qacc_smooth.copy()
@@ -155,10 +155,18 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
             arrays[2][:] += change
         momentum = dt * data.qfrc_constraint if is_stiff else None
         how = kept.mj, model, model.opt.integrator, step.is_discrete, is_stepped
-        problem.__dict__["engine_motion"] = partial(
-            _make_motion, how, dt, blocks, arrays, compliance, momentum, is_stiff
-        )
+        answer = partial(_make_motion, how, dt, blocks, arrays, compliance, momentum, is_stiff)
+    source = EngineSource(weakref.ref(data), model, np.array(data.qvel), is_stepped)
+    problem.set_record(EngineRecord(answer, source, _predict_velocity))
     return problem
+
+
+def _predict_velocity(source: EngineSource) -> FloatArray | None:
+    """Return the velocity after the step (nv,) that the answer predicts; None if the data were stepped since."""
+    data = source.get_data()
+    if data is None or not np.array_equal(data.qvel, source.velocity):
+        return None
+    return engine_answer(source.model, data).velocity
 
 
 def _make_motion(
@@ -240,11 +248,13 @@ def compute_prediction_gap(problem: Problem) -> float:
     It is 0 up to rounding, 1e-9 of the largest velocity; and NaN if the problem was made before the step, if the data
     were stepped since, or if the velocity cannot be predicted.
     """
-    model, data, is_stepped = find_source(problem)
-    if data is None or not is_stepped:
+    record = problem.record
+    if record is None or record.source is None or not record.source.is_stepped:
         return float("nan")
-    after = data.qvel
-    gap = float(np.abs(engine_answer(model, data).velocity - after).max(initial=0.0))
+    predicted, after = record.prediction, record.source.velocity
+    if predicted is None:
+        return float("nan")
+    gap = float(np.abs(predicted - after).max(initial=0.0))
     return (
         gap
         if not gap <= PREDICTION_TOLERANCE * max(1.0, float(np.abs(after).max(initial=0.0)))
@@ -257,12 +267,12 @@ def find_source(problem: Problem) -> tuple[Any, Any, bool]:
 
     The data are None if they do not exist any more, or if their velocities have changed.
     """
-    get_data, model, velocity, is_stepped = problem.__dict__.get(
-        "engine_step", (lambda: None, None, None, False)
-    )
-    data = get_data()
-    is_same = data is not None and np.array_equal(data.qvel, velocity)
-    return model, data if is_same else None, is_stepped
+    source = None if problem.record is None else problem.record.source
+    if source is None:
+        return None, None, False
+    data = source.get_data()
+    is_same = data is not None and np.array_equal(data.qvel, source.velocity)
+    return source.model, data if is_same else None, source.is_stepped
 
 
 def integrate_forces(mj: Any, model: Any, data: Any, jac: Any, force: FloatArray) -> FloatArray:

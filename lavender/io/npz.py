@@ -22,6 +22,7 @@ from lavender.io.engine_motion import MOVERS, EngineMotion
 from lavender.io.stored import Arrays, read_arrays, write_arrays
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import Cones, get_block_kinds
+from lavender.problem.engine_record import EngineRecord
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 
@@ -252,9 +253,8 @@ def _read_own_format(archive: Arrays) -> Stored:
             for name, n in zip(MOTION, (general.nv, problem.m, general.nv), strict=True)
             if name in archive or name in MOTION[:2]
         )
-        problem.__dict__["engine_motion"] = EngineMotion(
-            moved, change, compliance, moved_by, *momentum
-        )
+        answer = EngineMotion(moved, change, compliance, moved_by, *momentum)
+        problem.set_record(EngineRecord(answer))
     gap = _check_gap("entry 'gap'", archive["gap"], problem) if "gap" in archive else None
     return Stored(problem, "lavender", impulse=impulse, gap=gap)
 

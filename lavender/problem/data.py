@@ -31,6 +31,7 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
 from lavender.problem.derived import Derived, cached_property, late_field
+from lavender.problem.engine_record import EngineRecord
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
@@ -103,6 +104,8 @@ class ProblemData:
     qp: Any = field(default=None, repr=False, compare=False)
     angular: Any = None
     derived: Derived = field(init=False, repr=False)
+    #: What the engine left beside this problem, if an importer made it.
+    record: EngineRecord | None = field(default=None, init=False, repr=False, compare=False)
 
     def __init__(
         self,
@@ -448,17 +451,18 @@ class ProblemData:
 
     @property
     def engine_motion(self) -> Any:
-        """The `lavender.io.engine_motion.EngineMotion` of an engine's step, made at its first use; None without one."""
-        motion = self.__dict__.get("engine_motion")
-        if callable(motion):
-            motion = self.__dict__["engine_motion"] = motion()
-        return motion
+        """The `answer` of `record`, a `lavender.io.engine_motion.EngineMotion`; None without one."""
+        return None if self.record is None else self.record.answer
+
+    def set_record(self, record: EngineRecord) -> None:
+        """Set `record`, for importers: nothing that is computed from the problem depends on it but `residual`."""
+        self.__dict__["record"] = record
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles hold the fields, and the motion of an engine that `residual` judges: derived values are
         # computed again, and arrays stay read-only.
         motion = self.engine_motion
-        state = {} if motion is None else {"engine_motion": motion}
+        state = {} if motion is None else {"record": EngineRecord(motion)}
         values = tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
         return type(self), values, state
 

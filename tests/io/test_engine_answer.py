@@ -10,6 +10,7 @@ from mujoco_scene import get_state, mj, state
 import lavender as lv
 from lavender.io import mujoco as adapter
 from lavender.io.engine_motion import EngineMotion
+from lavender.problem.engine_record import EngineRecord
 
 # A pressed box, a falling box on top of it, and a hinged arm.
 MODEL = """<mujoco><option timestep="0.002" integrator="{integrator}" cone="{cone}" solver="{solver}"
@@ -100,6 +101,8 @@ def test_engine_answer_of_unconverged_solve_predicts_the_next_velocity(
             assert answer.moved_by == INTEGRATORS[integrator][3]
             # Sums of at most 20 rows in another order.
             np.testing.assert_allclose(answer.velocity, after.qvel, rtol=1e-9, atol=1e-12)
+            record = adapter.from_mujoco(model, data).record
+            np.testing.assert_array_equal(record.prediction, answer.velocity)
 
 
 def test_residual_of_acceleration_is_the_distance_of_row_velocities_from_the_exact_step(
@@ -149,9 +152,8 @@ def test_acceleration_of_an_island_is_compared_with_this_island_alone():
         compliance=0.1,
     )
     impulse = np.array([100.0, 0.5]) / 1.1
-    problem.__dict__["engine_motion"] = EngineMotion(
-        impulse, impulse, problem.compliance, "acceleration"
-    )
+    answer = EngineMotion(impulse, impulse, problem.compliance, "acceleration")
+    problem.set_record(EngineRecord(answer))
     found = lv.residual(problem, impulse)
     assert found.moved_by == "acceleration"
     np.testing.assert_allclose((found.velocity, found.relative), 0.5 / 1.1, rtol=1e-9)
@@ -163,7 +165,7 @@ def test_solve_from_an_engines_forces_judges_forces_also_if_its_acceleration_is_
         np.eye(2), np.eye(2), [-3.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf)
     )
     exact = np.array([3.0, 1.0])
-    problem.__dict__["engine_motion"] = EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")
+    problem.set_record(EngineRecord(EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")))
     assert lv.residual(problem, 0.5 * exact).relative < 1e-12
     solution = lv.solve(problem, impulse=0.5 * exact, tol=1e-9, **options)
     assert solution.success
