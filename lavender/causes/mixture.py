@@ -51,6 +51,11 @@ PARTS = tuple(part for parts in INGREDIENTS.values() for part in parts)
 TOL = 1e-12  # [-] Relative residual to which each mixture is solved.
 SOLVERS = ("newton", "auto")  # The second one solves if the first one does not converge.
 MAX_RESIDUAL = 1e-9  # [-] A mixture with a larger residual than this and its floor is not solved.
+# [-] The same with raised compliances: these change velocities by 1e-8 of themselves.
+MAX_RAISED_RESIDUAL = 1e-6
+# [-] An entry of the first three rows of a contact below this part of its column is rounding: they are three directions
+# of one point's velocity.
+ROUNDING = 64.0 * np.finfo(float).eps
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,7 @@ class Mixture:
     velocity: FloatArray  # (nv,) m/s, rad/s after the step.
     relative: float  # Relative residual of the solution [-].
     is_solved: bool
+    is_raised: bool = False  # Whether compliances near zero were raised.
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +114,10 @@ def solve_mixture(
             break
     assert best is not None
     relative = best.residual.relative
-    is_solved = relative <= max(MAX_RESIDUAL, best.residual.roundoff_floor)
-    return Mixture(step.velocity_of(best.impulse), relative, is_solved)
+    is_raised = raised is not None
+    limit = MAX_RAISED_RESIDUAL if is_raised else MAX_RESIDUAL
+    is_solved = relative <= max(limit, best.residual.roundoff_floor)
+    return Mixture(step.velocity_of(best.impulse), relative, is_solved, is_raised)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +213,7 @@ def _make_rows(
         cone = shape.cone
         if shape.condim == 1 or not cone or mu[0] <= 0.0:
             jac, cone, mu = jac[:1], "", np.zeros(0)
+        jac = _drop_rounding(jac)
     k = len(jac)
     shaped = replace(block, cone=cone, condim=k) if block.role == "contact" else block
     gap = np.zeros(k)
@@ -242,12 +251,14 @@ def _make_rows(
     if block.bias is not None and reference.rule != "rigid":
         known = min(k, len(block.bias))
         target[:known] += dt * phi[:known] * block.bias[:known]
+    # No impulse satisfies a rigid row that moves nothing, so that its reference has no meaning.
+    is_fixed = (compliance == 0.0) & ~(edges @ jac).any(axis=1)
     kind = block.role if block.role != "contact" or k > 1 else "limit"
     if cone == "pyramid":
         kind = "limit"
     return _Rows(
         edges @ jac,
-        edges @ target,
+        np.where(is_fixed, 0.0, edges @ target),
         compliance,
         kind,
         mu,
@@ -256,6 +267,16 @@ def _make_rows(
         block.bounds,
         block.own_cones,
     )
+
+
+def _drop_rounding(jac: FloatArray) -> FloatArray:
+    """Return the rows of a contact without entries of its normal and tangents that are rounding."""
+    point = jac[:3]
+    size = np.linalg.norm(point, axis=0)
+    if len(point) == 3 and (found := (point != 0.0) & (np.abs(point) <= ROUNDING * size)).any():
+        jac = jac.copy()
+        jac[:3][found] = 0.0
+    return jac
 
 
 def make_edges(cone: str, mu: FloatArray, k: int) -> FloatArray:
