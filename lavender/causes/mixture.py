@@ -224,14 +224,15 @@ def _make_rows(
         surface[:known] = block.surface_velocity[:known]
     reference = pairing.find_softness(sources["reference"], record, i) or block.softness
     softness = pairing.find_softness(sources["compliance"], record, i) or block.softness
-    rates, springs = _find_rates(shaped, reference, softness, k, gap, dt)
+    has_implicit_rows = sources["method"].implicit_rows
+    rates, springs = _find_rates(shaped, reference, softness, k, gap, dt, has_implicit_rows)
     weight = _find_weight(record, i, sources["mass"], pairing)
     edges = make_edges(cone, mu, k)
     compliance = _find_compliance(shaped, softness, weight, mu, cone, edges, jac, inverse)
     if cone == "pyramid" and reference.rule == "impedance":
         springs[1:] = springs[0]  # Each edge has the spring of the normal.
     phi = np.ones(k)
-    is_implicit = sources["method"].implicit_rows and softness.rule != "rigid"
+    is_implicit = has_implicit_rows and softness.rule != "rigid"
     if is_implicit:
         rows = edges @ jac
         diagonal, whole = np.diag(mass), np.diag(mass + added)
@@ -296,12 +297,13 @@ def make_edges(cone: str, mu: FloatArray, k: int) -> FloatArray:
 
 
 def _find_rates(
-    block: ConstraintBlock, reference: Softness, softness: Softness, k: int, gap: FloatArray, dt: float
+    block: ConstraintBlock, reference: Softness, softness: Softness, k: int, gap: FloatArray, dt: float,
+    is_implicit: bool,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return B [1/s] and K d [1/s^2] (k,) of the rows."""
     if reference.rule == "impedance":
         own = softness if softness.rule == "impedance" else reference
-        return compute_reference(block, reference, own, k)
+        return compute_reference(block, reference, own, k, is_implicit)
     if reference.rule == "rates":
         return _resize(reference.rate, k), _resize(reference.stiffness, k, 0.0)
     # Rigid: no velocity after the step, or the one that closes an open gap.

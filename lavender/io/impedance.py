@@ -51,14 +51,20 @@ def compute_impedance(solimp: FloatArray, gap: float) -> float:
 
 
 def compute_rate_and_stiffness(
-    solref: FloatArray, solimp: FloatArray, shortest_time: float
+    solref: FloatArray, solimp: FloatArray, shortest_time: float, impedance: float | None = None
 ) -> tuple[float, float]:
-    """Return B [1/s] and K [1/s^2] of a row with a position, equation (1)."""
+    """Return B [1/s] and K [1/s^2] of a row with a position, equation (1).
+
+    With the impedance d of an implicit row and the step h, half of `shortest_time`, the shortest time is the one for
+    which h^2 K d is 1.
+    """
     first, second = map(float, solref)
     if (first > 0.0) != (second > 0.0):
         first, second = 0.02, 1.0  # MuJoCo replaces mixed formats by its default.
     width = float(limit_solimp(solimp)[1])
     if first > 0.0:
+        if impedance is not None:
+            shortest_time *= 0.5 * float(np.sqrt(impedance)) / max(SMALLEST, width * second)
         first = max(first, shortest_time)
         stiffness = 1.0 / max(SMALLEST, (width * first * second) ** 2)
         return 2.0 / max(SMALLEST, width * first), stiffness
@@ -75,22 +81,34 @@ def measure_gap(block: ConstraintBlock) -> float:
 
 
 def compute_reference(
-    block: ConstraintBlock, reference: Softness, compliance: Softness, count: int
+    block: ConstraintBlock,
+    reference: Softness,
+    compliance: Softness,
+    count: int,
+    is_implicit: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return B [1/s] and K d [1/s^2] (count,) of the rows of a block with a solref and a solimp, equation (1)."""
-    solimp = compliance.solimp
-    rate, stiffness = compute_rate_and_stiffness(reference.solref, solimp, reference.shortest_time)
+    """Return B [1/s] and K d [1/s^2] (count,) of the rows of a block with a solref and a solimp, equation (1).
+
+    An integrator that is implicit in the rows (MuJoCo's "discrete") has a shortest time for limits and normals only.
+    """
+    solimp, shortest = compliance.solimp, reference.shortest_time
     impedance = compute_impedance(solimp, measure_gap(block))
+    of_normal, of_others = shortest, 0.0 if is_implicit else shortest
+    is_one_sided = block.role in ("contact", "limit")
+    if is_implicit and not is_one_sided:
+        of_normal = 0.0
+    rate, stiffness = compute_rate_and_stiffness(
+        reference.solref, solimp, of_normal, impedance if is_implicit and is_one_sided else None
+    )
     rates, springs = np.full(count, rate), np.full(count, stiffness * impedance)
     if block.role == "friction":
         springs[:] = 0.0
     if block.role == "contact":
         springs[1:] = 0.0
-        if reference.solref_friction.any() and block.cone == "ellipse":
-            own = compute_rate_and_stiffness(
-                reference.solref_friction, solimp, reference.shortest_time
-            )
-            rates[1:] = own[0]
+        has_own = reference.solref_friction.any()
+        if (has_own or is_implicit) and block.cone == "ellipse":
+            solref = reference.solref_friction if has_own else reference.solref
+            rates[1:] = compute_rate_and_stiffness(solref, solimp, of_others)[0]
     return rates, springs
 
 

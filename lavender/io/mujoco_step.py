@@ -644,7 +644,9 @@ class StepReader:
         data, block, rows = self.data, group.block, group.rows
         is_pyramid = block.has_friction and block.cone == "pyramid"
         count = block.condim if block.role == "contact" else len(rows)
-        rates, springs = compute_reference(block, block.softness, block.softness, count)
+        rates, springs = compute_reference(
+            block, block.softness, block.softness, count, self.is_discrete
+        )
         at = np.zeros(len(rows), int) if is_pyramid else np.arange(len(rows))
         rate, spring, impedance = self.read_rates(block, rows, rates[at], springs[at])
         fits = np.allclose(rate, rates[at], rtol=MODEL_TOLERANCE, atol=0.0)

@@ -491,3 +491,37 @@ def test_rigid_row_that_moves_nothing_is_no_unsolved_mixture():
     values = {"shape": "sphere", "size": ".1", "height": 0.0999, "turn": 0, "condim": 3}
     text = PRESSED.format(integrator="Euler", joint='type="slide" axis="1 0 0"', **values)
     assert not lv.compare(read_text(text, lambda model, data: None)).warnings
+
+
+SHORT = """<mujoco><option timestep="0.01" cone="{cone}" integrator="{integrator}" tolerance="0" iterations="200"/>
+<worldbody><geom type="plane" size="3 3 .1" solref="{solref}"/>
+<body pos="0 0 .0992"><freejoint/><geom type="sphere" size=".1" mass="1" solref="{solref}"/></body>
+<body pos="1 0 1"><joint name="j" axis="0 1 0" range="-10 10" limited="true" solreflimit="{solref}" frictionloss="1"
+solreffriction="{solref}"/><geom size=".1" pos=".2 0 0"/></body>
+<body pos="2 0 1"><joint name="k" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody>
+<equality><joint joint1="k" solref="{solref}"/></equality></mujoco>"""
+
+
+def read_short(cone, integrator, solref):
+    text = SHORT.format(cone=cone, integrator=integrator, solref=solref)
+
+    def turn(model, data):
+        data.qpos[-2:] = 0.5, 0.02
+
+    return read_text(text, turn)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("solref", ["0.004 1", "0.004 0.4", "0.012 2", "-4e4 -100"])
+def test_shortest_time_of_a_solref_belongs_to_the_integrator(cone, solref):
+    """Euler's method does not use time constants below two steps; `discrete` has another rule for each kind of row."""
+    pair = [read_short(cone, x, solref) for x in ("Euler", "discrete")]
+    for record in pair:
+        assert {x.softness.rule for x in record.blocks} == {"impedance"}
+        roles = {"contact", "limit", "friction", "equality"}
+        assert {x.role for x in record.blocks} == roles
+        exact = lv.compare(record, record).exact_a
+        np.testing.assert_allclose(exact, record.velocity_after, rtol=0, atol=1e-9)
+    found = lv.compare(*pair)
+    others = [p.mean for name, p in found.parts.items() if name != "integrator"]
+    assert np.abs(found.difference).max() > 1e-3 and np.abs(others).max() < 1e-9
