@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from lavender.io.contact_friction import find_geom
+
 
 def get_geoms(contact: str) -> str:
     """Return the names of both geoms of a contact, without the contact's number."""
@@ -22,9 +24,3 @@ def find_bodies(mj: Any, model: Any, contact: str) -> str:
     bodies = [int(model.body_weldid[model.geom_bodyid[geom]]) for geom in geoms]
     kind = mj.mjtObj.mjOBJ_BODY
     return " and ".join(sorted(mj.mj_id2name(model, kind, b) or f"body {b}" for b in bodies))
-
-
-def find_geom(mj: Any, model: Any, name: str) -> int:
-    """Return the number of a geom by its name, or by its number if it has no name; -1 if there is none."""
-    geom = int(mj.mj_name2id(model, mj.mjtObj.mjOBJ_GEOM, name))
-    return int(name) if geom < 0 and name.isdigit() and int(name) < model.ngeom else geom

@@ -58,9 +58,9 @@ SHOWN_RATIO = (
 TREND_RATIO = (
     2.0  # Errors grow or fall if the 99 % quantile of the last quarter differs by this factor.
 )
-# Errors up to this part of the limit are roundings, whose trend says nothing.
-ROUNDING_SHARE = 1e-6
 MIN_TREND_SHARE = 0.05  # Share of the steps that has to exceed it; fewer are isolated spikes.
+# [-] No trend is named if the error that 1 % of the steps exceed stays below this part of the limit.
+MIN_TREND_PART = 1e-6
 MAX_NAMED_ROWS = 8  # Rows of the table of rows.
 FORCES_NOTE = (
     "Impulse of the engine / time step, beside the exact solution's. The bodies alone determine a force of a contact, "
@@ -319,13 +319,13 @@ class AuditCounts:
         if not all(map(len, known)):
             return text
         early, late = (float(np.quantile(part, 0.99, method="higher")) for part in known)
-        if max(early, late) < ROUNDING_SHARE * self.limit:
-            return text
         # Isolated spikes are no trend: a share of the steps has to exceed the other part's quantile by the factor.
         shares = [
             float(np.mean(part > TREND_RATIO * other))
             for part, other in zip(known, (late, early), strict=True)
         ]
+        if max(early, late) < MIN_TREND_PART * self.limit:
+            return text  # Errors of rounding have no trend that matters.
         trend = "Growing" if shares[1] >= MIN_TREND_SHARE else "Steady"
         trend = "Falling" if shares[0] >= MIN_TREND_SHARE > shares[1] else trend
         sizes = [format_speed(x, self.units) for x in (early, late)]

@@ -24,6 +24,7 @@ from lavender.diagnostics.forces import (
     measure_forces,
     tabulate_contacts,
 )
+from lavender.io.contact_friction import find_friction
 from lavender.io.mujoco import PREDICTION_TOLERANCE
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.judge.residuals import UNCONVERGED, VERDICTS, WRONG
@@ -234,13 +235,16 @@ def tabulate_forces(
     answers = [flat[frame.batch.rows_of(i)] for i in steps]
     exact = solve_many(problems, impulses=answers, tol=REFERENCE_TOL, errors="status")
     pairs = cache(partial(find_bodies, import_mujoco(), model))
+    friction = cache(partial(find_friction, model))
     dt = float(model.opt.timestep)
     found: list[ContactForces] = []
     places: list[tuple[int, int]] = []
     for k, (i, problem, answer) in enumerate(zip(steps, problems, answers, strict=True)):
         solution = exact[k]
         if is_reference(solution.residual):
-            forces = measure_forces(problem, answer, solution.impulse, dt, pairs, solution.residual)
+            forces = measure_forces(
+                problem, answer, solution.impulse, dt, pairs, solution.residual, friction
+            )
             found.append(forces)
             places += [(int(world[i]), int(step[i]))] * len(forces.contacts)
     table = tabulate_contacts(found)

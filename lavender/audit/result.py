@@ -32,6 +32,7 @@ from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
 from lavender.diagnostics.forces import CONTACT, ContactForces, contact_forces
+from lavender.io.contact_friction import find_friction
 from lavender.io.mujoco import read_gaps
 from lavender.io.mujoco_memory import import_mujoco
 from lavender.io.npz import write_npz
@@ -461,8 +462,10 @@ class Audit:
         for i, w in enumerate(self.worst if self.runs.model is not None else (), 1):
             dt = float(self.runs.model.opt.timestep)
             pairs = partial(find_bodies, import_mujoco(), self.runs.model)
+            friction = partial(find_friction, self.runs.model)
             with contextlib.suppress(InputError):  # A step without a solution has no exact forces.
-                found.append((i, w, contact_forces(w.problem, w.impulse, dt=dt, pairs=pairs)))
+                forces = contact_forces(w.problem, w.impulse, dt=dt, pairs=pairs, friction=friction)
+                found.append((i, w, forces))
         return found
 
     @property

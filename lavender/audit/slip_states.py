@@ -6,7 +6,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from operator import itemgetter
 from pathlib import Path
 from time import perf_counter
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.audit.bodies import find_bodies, find_geom, get_geoms
+from lavender.audit.bodies import find_bodies, get_geoms
 from lavender.audit.idle_settings import MIN_CHANGE, PHYSICS_OPTIONS, list_idle_settings
 from lavender.audit.page import FORCES_NOTE, ResultPage
 from lavender.audit.provenance import describe_provenance, format_provenance
@@ -38,9 +38,10 @@ from lavender.base.lazy_import import markupsafe
 from lavender.base.lazy_import import pandas as pd
 from lavender.diagnostics.forces import contact_forces, tabulate_contacts
 from lavender.io import mujoco as adapter
+from lavender.io.contact_friction import find_geom
 from lavender.io.mujoco import from_mujoco
 from lavender.io.mujoco_memory import import_mujoco
-from lavender.io.mujoco_step import step_from_mujoco
+from lavender.io.mujoco_step import ContactReader, step_from_mujoco
 from lavender.io.start_states import Control, load_model, read_states
 from lavender.report.page import Page, make_shares, tabulate_frame
 from lavender.report.runner import Event
@@ -52,6 +53,10 @@ MIN_LASTING_SHARE = (
 )
 MAX_REMEDY_STATES = (
     8  # Settings are simulated from up to this many states, those with the largest slip.
+)
+# Colours of the causes in the order of `CAUSES`, as the style sheet of pages names them.
+CAUSE_COLORS = tuple(
+    f"var(--{name})" for name in ("s0", "s1", "s2", "s3", "s4", "h1", "quiet", "line", "ink")
 )
 FRICTION_FACTOR = 2.0  # The friction coefficient is multiplied by this in one of the settings.
 
@@ -180,12 +185,12 @@ class SlipOfStates:
             parts = [
                 (
                     cause,
-                    f"var(--s{i})",
+                    color,
                     float(shares[cause]) / total,
                     [format_speed(first[cause])],
                     "",
                 )
-                for i, cause in enumerate(CAUSES.values())
+                for cause, color in zip(CAUSES.values(), CAUSE_COLORS, strict=True)
             ]
             causes = make_shares(parts, title=f"Causes of the slip of {first['contact']}")
             drawn = [markupsafe.Markup(worst.draw_slip(folder))] if worst.remedies else []
@@ -449,6 +454,12 @@ def _simulate_slip(
     """
     mj = import_mujoco()
     data = mj.MjData(model)
+    reader = ContactReader(mj, model, data)
+
+    @cache
+    def find_pair(geoms: tuple[str, ...]) -> str:
+        return find_bodies(mj, model, f"contact ({', '.join(geoms)})")
+
     means = np.full(REMEDY_STEPS + 1, np.nan)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
     with count_engine_warnings(mj):
@@ -457,15 +468,14 @@ def _simulate_slip(
                 mj.mj_forward(model, data)
                 if _is_diverging(mj, data):
                     return number, means, step
-                record = step_from_mujoco(model, data)
+                sliding = [
+                    read_slip(block)
+                    for block in reader.read_contacts()
+                    if block.has_friction and find_pair(block.geoms or (block.key,)) == pair
+                ]
                 mj.mj_step(model, data)
             except mj.FatalError:
                 return number, means, step
-            sliding = [
-                read_slip(block)
-                for name, block in zip(name_blocks(record), record.blocks, strict=True)
-                if block.has_friction and find_bodies(mj, model, name) == pair
-            ]
             speeds = [np.linalg.norm(rows @ data.qvel - surface) for rows, surface in sliding]
             if speeds:
                 means[step] = np.mean(speeds)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import pandas as pd
 from lavender.base.lazy_import import sparse as sp
 from lavender.diagnostics.redundancy import MIN_NEW_PART, redundancy
+from lavender.io import mujoco as adapter
+from lavender.io.contact_friction import find_friction
 from lavender.judge.residuals import Residual, residual
 from lavender.judge.solution import raise_if_interrupted
 from lavender.problem import Problem, check_problem
@@ -59,8 +62,8 @@ class ContactForces:
     pairs : tuple of str
         Names of the two bodies of each contact.
     normal, tangential : (c,) N
-        Normal force and norm of the friction force of the given impulse; the latter is nan for a pyramid, and if it is
-        not determined.
+        Normal force and norm of the friction force of the given impulse; the latter is nan if it is not determined, and
+        for a pyramid whose coefficients are not known.
     exact : (c,) N
         Normal force of the reference.
     error : (c,) N
@@ -160,6 +163,7 @@ def contact_forces(
     dt: float,
     reference: Any = None,
     pairs: Sequence[str] | Callable[[str], str] | None = None,
+    friction: Callable[[str], Any] | None = None,
 ) -> ContactForces:
     """Return the forces of all contacts in newtons, with their errors, and what of them the data determine.
 
@@ -176,6 +180,9 @@ def contact_forces(
     pairs : names or callable, optional
         Name of the pair of bodies of each contact, in the order of the contacts, or a function that returns it for the
         name of a contact. Default: the bodies of a problem of bodies, or the text in parentheses of the contact's name.
+    friction : callable, optional
+        Function that returns the coefficients (2,) [-] of both tangents for the name of a contact, or None: the edges
+        of a pyramid do not have them. Default: those of MuJoCo's model, if `from_mujoco` made the problem.
 
     Returns
     -------
@@ -198,7 +205,10 @@ def contact_forces(
             f"reference has a relative residual of {judged.relative:.1e}; {1e3 * REFERENCE_TOL:.0e}, or its floor, is "
             "needed: forces of a step without a solution have no error"
         )
-    return measure_forces(problem, own, exact, dt, pairs, judged)
+    model = adapter.find_source(problem)[0]
+    if friction is None and model is not None:
+        friction = partial(find_friction, model)
+    return measure_forces(problem, own, exact, dt, pairs, judged, friction)
 
 
 def is_reference(judged: Residual) -> bool:
@@ -213,9 +223,13 @@ def measure_forces(
     dt: float,
     pairs: Sequence[str] | Callable[[str], str] | None,
     judged: Residual,
+    friction_of: Callable[[str], Any] | None = None,
 ) -> ContactForces:
-    """Return the forces of an impulse [N s] beside those of a solution, whose residual is `judged`."""
-    found = _list_contacts(problem)
+    """Return the forces of an impulse [N s] beside those of a solution, whose residual is `judged`.
+
+    `friction_of` returns the coefficients (2,) of both tangents for the name of a contact, or None.
+    """
+    found = _list_contacts(problem, friction_of)
     if callable(pairs):
         pairs = [pairs(contact.name) for contact in found]
     names = [contact.pair for contact in found] if pairs is None else list(map(str, pairs))
@@ -228,7 +242,7 @@ def measure_forces(
         """Return the normal force (c,) and the friction force (c, 2) [N] of an impulse."""
         friction = np.zeros((len(found), 2))
         for k, contact in enumerate(found):
-            friction[k, : len(contact.tangents)] = x[contact.tangents]
+            friction[k] = contact.weights @ x[contact.tangents]
         return np.array([x[contact.normals].sum() for contact in found]) / dt, friction / dt
 
     (normal, friction), (correct, wanted) = measure(own), measure(exact)
@@ -253,19 +267,30 @@ def measure_forces(
 
 
 class _Contact(NamedTuple):
-    """A contact with the names of its bodies: its normal row, or the edges of its pyramid, and its tangents."""
+    """A contact with the names of its bodies and its rows.
+
+    `normals` are its normal row, or the edges of its pyramid. `weights` (2, rows) times the impulses of the rows
+    `tangents` are its friction impulses along both tangents [N s]; nan if the coefficients of a pyramid are not known.
+    """
 
     name: str
     pair: str
     normals: list[int]
     tangents: list[int]
+    weights: FloatArray
 
 
-def _list_contacts(problem: Problem) -> list[_Contact]:
-    """Return the contacts of a problem; rows "NAME, edge K" from edge 0 on are one contact NAME with a pyramid."""
+def _list_contacts(
+    problem: Problem, friction_of: Callable[[str], Any] | None = None
+) -> list[_Contact]:
+    """Return the contacts of a problem; rows "NAME, edge K" from edge 0 on are one contact NAME with a pyramid.
+
+    The edges 2 j and 2 j + 1 of a pyramid are the normal plus and minus the coefficient times tangent j. The tangents
+    of MuJoCo's elliptic contacts are scaled by their coefficient divided by the first one.
+    """
     cones, rows = problem.cones, problem.rows
     contacts: list[_Contact] = []
-    pyramids: dict[str, _Contact] = {}
+    pyramids: dict[str, int] = {}
     bodies: Iterator[list[int]] = iter([] if rows is None else rows.contact_body.tolist())
     for k in range(problem.n_blocks):
         name, first = problem.block_name(k), int(cones.ptr[k])
@@ -274,14 +299,29 @@ def _list_contacts(problem: Problem) -> list[_Contact]:
             if not edge:
                 continue
             if name not in pyramids or number == "0":
-                pyramids[name] = _Contact(name, name_pair(name) or name, [], [])
-                contacts.append(pyramids[name])
-            pyramids[name].normals.extend(range(first, int(cones.ptr[k + 1])))
+                pyramids[name] = len(contacts)
+                pair = name_pair(name) or name
+                contacts.append(_Contact(name, pair, [], [], np.zeros((2, 0))))
+            own = range(first, int(cones.ptr[k + 1]))
+            contacts[pyramids[name]].normals.extend(own)
             continue
-        own = " and ".join("ground" if b < 0 else f"body {b}" for b in next(bodies, ()))
-        pair = name_pair(name) or own or name
+        own_pair = " and ".join("ground" if b < 0 else f"body {b}" for b in next(bodies, ()))
+        pair = name_pair(name) or own_pair or name
         count = min(2, int(cones.n_tangents[k]))
-        contacts.append(_Contact(name, pair, [first], list(range(first + 1, first + 1 + count))))
+        tangents = list(range(first + 1, first + 1 + count))
+        contacts.append(_Contact(name, pair, [first], tangents, np.eye(2)[:, :count]))
+    for k, contact in enumerate(contacts):
+        found = None if friction_of is None else friction_of(contact.name)
+        is_pyramid = len(contact.normals) > 1
+        if not is_pyramid and (found is None or len(contact.tangents) < 2):
+            continue
+        mu = np.full(2, np.nan) if found is None else np.asarray(found, float)
+        if is_pyramid:
+            signs = np.array([[mu[0], -mu[0], 0.0, 0.0], [0.0, 0.0, mu[1], -mu[1]]])
+            edges = contact.normals[:4]
+            contacts[k] = contact._replace(tangents=edges, weights=signs[:, : len(edges)])
+        else:
+            contacts[k] = contact._replace(weights=np.diag([1.0, mu[1] / mu[0]]))
     return contacts
 
 
@@ -304,7 +344,7 @@ def _find_determined(
         contact_of[contact.normals], pair_of[contact.normals] = k, labels[names[k]]
         is_contact[[*contact.normals, *contact.tangents]] = True
     is_alone, has_sum = np.ones(len(contacts), bool), np.ones(len(labels), bool)
-    has_friction = np.array([len(contact.normals) == 1 for contact in contacts], bool)
+    has_friction = np.array([np.isfinite(contact.weights).all() for contact in contacts], bool)
     loads = np.array([exact[contact.normals].sum() for contact in contacts])
     islands = [
         get_rows_of_blocks(problem, x) for x in group_blocks_by_island(*find_islands(problem))
@@ -329,7 +369,7 @@ def _find_determined(
         at = {int(row): i for i, row in enumerate(rows)}
         for k in inside.tolist():
             own = [at[row] for row in contacts[k].tangents]
-            change = scale * float(np.linalg.norm(vectors[:, own]))
+            change = scale * float(np.linalg.norm(vectors[:, own] @ contacts[k].weights.T))
             if change > max(NULL_ENTRY * scale, DETERMINED_TO * loads[k]):
                 has_friction[k] = False
     kinds = [

@@ -9,7 +9,7 @@ from pathlib import Path
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.export.amalgamate import ExtractionError, amalgamate, hash_sources
-from lavender.io.stored import as_path, check_writable, load_or_make_file, make_folder, write_bytes
+from lavender.io.stored import check_writable, load_or_make_file, make_folder, write_bytes
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
@@ -49,7 +49,7 @@ def write(out: str | os.PathLike[str], *, replace: bool = False) -> list[Path]:
 
     Parameters
     ----------
-    out : path
+    out : str or os.PathLike
         Folder, which is created if it does not exist. Files with other names in it are kept.
     replace : bool
         Whether to replace existing files with other contents.
@@ -66,8 +66,7 @@ def write(out: str | os.PathLike[str], *, replace: bool = False) -> list[Path]:
     LavenderError
         `source` raises it.
     """
-    out = as_path(out)
-    check_writable(out, folder=True)
+    out = check_writable(out, folder=True)
     folder = HERE / "c"
     contents = {
         p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8")

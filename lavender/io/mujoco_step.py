@@ -9,6 +9,7 @@ integrator with unit forces, or from MuJoCo's own arrays with "discrete".
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -469,8 +470,15 @@ class StepReader:
 
     def read_blocks(self, mass: FloatArray, added: FloatArray) -> list[_Rows]:
         """Return the blocks of all constraint rows."""
-        data = self.data
         groups: list[_Rows] = []
+        for kind, which, rows in self.list_rows():
+            group = self.read_contact(rows) if kind >= 5 else self.read_joint(rows, kind, which)
+            groups.append(self.check(group, mass, added))
+        return groups
+
+    def list_rows(self) -> Iterator[tuple[int, int, IntArray]]:
+        """Yield the kind of each constraint (mjtConstraint), its number among those of its kind, and its rows."""
+        data = self.data
         i = 0
         while i < data.nefc:
             kind, which = int(data.efc_type[i]), int(data.efc_id[i])
@@ -479,11 +487,8 @@ class StepReader:
             if kind == EQUALITY or kind >= 5:
                 different = np.flatnonzero(~is_alike[i:])
                 size = int(different[0]) if len(different) else data.nefc - i
-            rows: IntArray = np.arange(i, i + size, dtype=np.int32)
-            group = self.read_contact(rows) if kind >= 5 else self.read_joint(rows, kind, which)
-            groups.append(self.check(group, mass, added))
+            yield kind, which, np.arange(i, i + size, dtype=np.int32)
             i += size
-        return groups
 
     def read_joint(self, rows: IntArray, kind: int, which: int) -> _Rows:
         """Return the block of an equality, a limit or dry friction."""
@@ -786,3 +791,19 @@ def name_bodies_and_joints(model: Any) -> tuple[list[str], list[str]]:
 
 def _name(element: Any, kind: str, number: int) -> str:
     return element.name or f"{kind} {number}"
+
+
+class ContactReader(StepReader):
+    """Contacts of the forward passes of one MjData, without masses and softness: much cheaper than a whole step."""
+
+    def __init__(self, mj: Any, model: Any, data: Any) -> None:
+        self.mj, self.model = mj, model
+        self.data = self.host = data
+        self.name_elements()
+
+    def read_contacts(self) -> list[ConstraintBlock]:
+        """Return the blocks of the contacts after a forward pass; their softness is not checked."""
+        needs_rows = bool(getattr(self.model, "flg_surfacevel", False)) or self.model.nflex > 0
+        if needs_rows:
+            self.jacobian = single.jacobian(self.model, self.data).toarray()
+        return [self.read_contact(rows).block for kind, _, rows in self.list_rows() if kind >= 5]

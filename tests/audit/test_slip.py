@@ -1,6 +1,7 @@
 """The cause of slip of scenes whose answer is known."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ from mujoco_scene import get_state
 from mujoco_scene import mj as mujoco
 
 import lavender as lv
-from lavender.audit.slip import REMEDY_STEPS, explain_slip
-from lavender.audit.slip_states import explain_slip_of_states
+from lavender.audit.slip import CAUSES, REMEDY_STEPS, explain_slip
+from lavender.audit.slip_states import CAUSE_COLORS, explain_slip_of_states
 
 GRAVITY = 9.81
 
@@ -22,6 +23,14 @@ def block(angle, friction=0.5, option="", condim=3):
       <worldbody><geom name="slope" type="plane" size="50 50 .1"/>
       <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body>
       </worldbody></mujoco>""")
+
+
+def test_causes_have_colours_of_their_own_that_the_style_sheet_defines():
+    style = Path(lv.__file__).parent / "report" / "templates" / "style.css"
+    text = style.read_text(encoding="utf-8")
+    names = [color.removeprefix("var(").removesuffix(")") for color in CAUSE_COLORS]
+    assert len(set(names)) == len(CAUSES) == len(names)
+    assert all(f"{name}:" in text for name in names)
 
 
 def dominant(explanation):

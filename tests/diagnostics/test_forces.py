@@ -138,6 +138,35 @@ def test_forces_of_mujoco_are_those_of_mj_contact_force(cone):
     assert forces.normal[0] == pytest.approx(2.0 * 9.81, rel=1e-3)
 
 
+@pytest.mark.parametrize("condim", [3, 4, 6])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("pair", [False, True])
+def test_friction_force_of_mujoco_is_that_of_mj_contact_force(cone, condim, pair):
+    """A pushed ball; pyramids have friction in their edges, and tangents of a pair two coefficients."""
+    mujoco = pytest.importorskip(
+        "mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'"
+    )
+    own = f'<pair geom1="ball" geom2="floor" condim="{condim}" friction="0.8 0.4 .01 .002 .002"/>'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option cone="{cone}"/><worldbody>
+      <geom name="floor" type="plane" size="0 0 1" friction="0.3"/><body pos="0 0 .1"><freejoint/>
+      <geom name="ball" type="sphere" size=".1" mass="2" condim="{condim}" friction="0.6 .01 .002"/></body></worldbody>
+      <contact>{own if pair else ""}</contact></mujoco>""")
+    data = mujoco.MjData(model)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    data.xfrc_applied[1, :2] = 3.0, -5.0
+    mujoco.mj_forward(model, data)
+    problem, impulse = lv.io.from_mujoco(model, data), lv.io.mujoco.impulse(model, data)
+    forces = lv.contact_forces(problem, impulse, dt=model.opt.timestep)
+    wanted = np.zeros(6)
+    mujoco.mj_contactForce(model, data, 0, wanted)
+    assert forces.determined == ("contact",) and forces.normal == pytest.approx([wanted[0]])
+    assert np.linalg.norm(wanted[1:3]) > 1.0
+    assert forces.tangential == pytest.approx([np.linalg.norm(wanted[1:3])], rel=1e-9)
+    unknown = lv.contact_forces(problem, impulse, dt=model.opt.timestep, friction=lambda name: None)
+    assert np.isnan(unknown.tangential).all() == (cone == "pyramidal")
+
+
 def test_contact_forces_refuse_wrong_arguments():
     problem = make_table(THREE)
     impulse = lv.solve(problem).impulse

@@ -106,6 +106,16 @@ def test_checksums_are_of_the_files(folder):
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == value
 
 
+def test_export_accepts_a_path_as_text_and_refuses_others(tmp_path, folder):
+    written = export.write(str(tmp_path / "c"))
+    assert {p.name for p in written} >= {"lavender.c", "SHA256SUMS"}
+    assert all(
+        p.read_bytes() == (folder / p.relative_to(tmp_path / "c")).read_bytes() for p in written
+    )
+    with pytest.raises(lv.InputError, match="path is 3"):
+        export.write(3)
+
+
 def test_export_does_not_replace_other_files(tmp_path, folder):
     (tmp_path / "lavender.h").write_text("mine")
     with pytest.raises(LavenderError, match="--replace"):
