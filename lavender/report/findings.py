@@ -227,17 +227,21 @@ class Report(Contents):
         missed = (self.ranking["tried"] - self.ranking["solved"]).sort_values(
             ascending=False, kind="stable"
         )
-        missed = missed[missed > 0]
+        tried = int(self.ranking["tried"].get(ENGINE_NAME, 0))
+        own = int(missed.get(ENGINE_NAME, 0))  # Its answers are recorded, not timed.
+        engine = f" {own} of {tried} answers of your engine miss the tolerance." if own else ""
+        missed = missed[(missed > 0) & (missed.index != ENGINE_NAME)]
         limit = "" if self.is_campaign else f" in {format_time(self.time_limit)}"
         if not len(missed):
             several = len(self.ranking) > 1
-            return f"Every solver solves each problem that it accepts{limit}." if several else ""
+            all_solve = f"Every solver solves each problem that it accepts{limit}."
+            return f"{all_solve if several else ''}{engine}".strip()
         text = ", ".join(f"{n} by {name}" for name, n in missed.head(6).items())
         text += f" and {len(missed) - 6} more solvers" if len(missed) > 6 else ""
         if self.ranking.loc[self.first, "solved"] < len(self.subject):
             unsolved = self.get_times(self.tolerance)[self.subject].loc[self.first]
             text += f". {self.first} misses {_join(unsolved.index[unsolved.isna()])}"
-        return f"Not solved{limit}: {text}."
+        return f"Not solved{limit}: {text}.{engine}"
 
     def _describe_steps(self, steps: Sequence[str]) -> str:
         """Return how steps of sequences are solved, if they are not the first sentence, and their warm starts."""
