@@ -28,6 +28,7 @@ from benchmarks.score.settings import ENGINES, NOT_RUN, RULE
 from benchmarks.score.simulate import split_requirement
 
 CAUSES_RANGE = (-2.5, 3.5)  # [-]
+LARGE_SHARE = 0.1  # [-]
 N_COLORS = 64  # Number of colours of a picture.
 STATIC = ROOT / "docs" / "static" / "scorecard"
 COLORS = ("#2166ac", "#92c5de", "#f4a582", "#b2182b")  # good, fair, poor, wrong
@@ -49,12 +50,12 @@ def find(rows, engine, column, scene):
     return rows.get((engine, level, rate, scene))
 
 
-def get_engines(rows):
-    """Return the names of the rows whose cells have all been run."""
+def get_engines(rows, columns=COLUMNS):
+    """Return the names of the rows whose cells of some columns have all been run."""
     return [
         name
         for name in ENGINES
-        if all(find(rows, name, column, scene) for column in COLUMNS for scene in SCENES)
+        if all(find(rows, name, column, scene) for column in columns for scene in SCENES)
     ]
 
 
@@ -87,7 +88,7 @@ def describe(row, scene):
 
 def draw_heat(rows, column):
     """Draw the errors of all engines and scenes in a column, coloured by class."""
-    names = get_engines(rows)
+    names = get_engines(rows, (column,))
     figure = Figure(figsize=(11, 0.3 * len(names) + 1.2), layout="constrained")
     axes = figure.subplots()
     for i, engine in enumerate(names):
@@ -135,7 +136,7 @@ def draw_headings(rows):
     angles = np.concatenate([turns + k * math.pi / 2 for k in range(4)])
     for k, column in enumerate(COLUMNS[:2]):
         axes = figure.add_subplot(1, 2, k + 1, projection="polar")
-        for name, style in get_styles(get_engines(rows)).items():
+        for name, style in get_styles(get_engines(rows, COLUMNS[:1])).items():
             row = find(rows, name, column, "heading")
             if row and row.values:
                 values = [*row.values, *row.values[-2::-1]] * 4
@@ -161,7 +162,7 @@ def draw_rates(rows):
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     for axes, column in zip(figure.subplots(1, 2, sharey=True), COLUMNS[:2], strict=True):
         axes.axhline(0.64, color="k", lw=4, alpha=0.25, label="truth, e² h")
-        for name, style in get_styles(get_engines(rows)).items():
+        for name, style in get_styles(get_engines(rows, COLUMNS[:1])).items():
             row = find(rows, name, column, "rates")
             if row and row.values:
                 axes.semilogx(RATES, row.values, ms=4, lw=1, label=ENGINES[name].title, **style)
@@ -180,7 +181,7 @@ def draw_costs(rows):
     figure = Figure(figsize=(13, 10.5), layout="constrained")
     panels = figure.subplots(4, 5).ravel()
     for axes, (scene, data) in zip(panels, SCENES.items(), strict=False):
-        for name, style in get_styles(get_engines(rows)).items():
+        for name, style in get_styles(get_engines(rows, COLUMNS[:1])).items():
             for row in rows.values():
                 if (
                     (row.engine, row.scene) == (name, scene)
@@ -200,7 +201,7 @@ def draw_costs(rows):
             axes.axhline(limit, color=color, lw=1)
         axes.set_title(f"{scene} [{data.unit}]", fontsize=9)
         axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-    for name, style in get_styles(get_engines(rows)).items():
+    for name, style in get_styles(get_engines(rows, COLUMNS[:1])).items():
         panels[-1].plot(
             [], [], style["marker"], color=style["color"], ls="", label=ENGINES[name].title
         )
@@ -274,16 +275,28 @@ def make_reason_table():
 
 def make_missing_table(rows):
     """Return the engines that were tried and are not in the table, and rows without cells."""
-    waiting = [ENGINES[name].title for name in ENGINES if name not in get_engines(rows)]
-    line = (", ".join(waiting), "adapters and settings exist; not all cells have been run")
-    return markdown(("engine", "reason"), [line, *NOT_RUN.items()])
+    whole, default = get_engines(rows), get_engines(rows, COLUMNS[:1])
+    parts = {
+        "adapters and settings exist; the cells have not been run": [
+            name for name in ENGINES if name not in default
+        ],
+        "the accurate columns have not all been run": [n for n in default if n not in whole],
+    }
+    lines = [
+        (", ".join(ENGINES[name].title for name in names), reason)
+        for reason, names in parts.items()
+        if names
+    ]
+    return markdown(("engine", "reason"), [*lines, *NOT_RUN.items()])
 
 
 def join_names(names, rows):
     """Return titles of rows as text, the engine's alone if it has all of its rows."""
     titles = []
     for name in names:
-        siblings = [n for n in get_engines(rows) if ENGINES[n].engine == ENGINES[name].engine]
+        siblings = [
+            n for n in get_engines(rows, COLUMNS[:1]) if ENGINES[n].engine == ENGINES[name].engine
+        ]
         title = ENGINES[name].title
         titles.append(title.split(" (")[0] if set(siblings) <= set(names) else title)
     titles = list(dict.fromkeys(titles))
@@ -301,7 +314,7 @@ def count_changes(rows, before, after):
     """Return how many cells have a better and a worse class in the second of two columns, without slow ones."""
     pairs = [
         [get_class(find(rows, name, column, scene)) for column in (before, after)]
-        for name in get_engines(rows)
+        for name in get_engines(rows, (before, after))
         for scene in SCENES
         if not (SCENES[scene].own_rates and before[0] == after[0])
     ]
@@ -318,7 +331,7 @@ def count_passed(rows, name, column):
 def make_findings(rows):
     """Return the sentences of the page that have numbers or names of engines, one item each."""
     default, accurate, fine = COLUMNS
-    names = get_engines(rows)
+    names = get_engines(rows, COLUMNS[:1])
 
     def error(name, scene, column):
         row = find(rows, name, column, scene)
@@ -374,74 +387,98 @@ def make_findings(rows):
 
 
 def make_limits(rows):
-    """Return the sentences on what the engines cannot express and on times."""
+    """Return the sentences on the rows, on what the engines cannot express, and on times."""
+    names = get_engines(rows, COLUMNS[:1])
     why = {}
-    for name in get_engines(rows):
+    for name in names:
         row = find(rows, name, COLUMNS[0], "bounce")
         if row and row.note.startswith("cannot: no "):
             why.setdefault(row.note.removeprefix("cannot: "), []).append(name)
     engines = [
-        (sorted({ENGINES[name].title.split(" (")[0] for name in names}), reason.split(", ")[-1])
-        for reason, names in why.items()
+        (sorted({ENGINES[name].title.split(" (")[0] for name in same}), reason.split(", ")[-1])
+        for reason, same in why.items()
     ]
     bounce = "; ".join(f"{', '.join(titles)}: {reason}" for titles, reason in engines)
     curves = ", ".join(f"`{name}`" for name, scene in SCENES.items() if scene.curve)
-    count = len({ENGINES[name].engine for name in get_engines(rows)})
+    patient = [name for name in names if ENGINES[name].patience > 1.0]
+    times = {ENGINES[name].patience for name in patient}
+    assert len(times) <= 1, "the sentence on slow engines names one limit"
+    longer = f"; {times.pop():g} times that for {join_names(patient, rows)}" if patient else ""
+    partial = [name for name in names if name not in get_engines(rows)]
+    count = len({ENGINES[name].engine for name in names})
     return (
-        f"{count} engines in {len(get_engines(rows))} rows: several solvers of one engine are rows. Violet: more than "
-        f"{LIMIT:g} s of CPU time, {CURVE_FACTOR * LIMIT:g} s for {curves}. No coefficient of restitution: {bounce}."
+        f"{count} engines in {len(names)} rows: several solvers of one engine are rows. Violet: more than "
+        f"{LIMIT:g} s of CPU time, {CURVE_FACTOR * LIMIT:g} s for {curves}{longer}. No coefficient of restitution: "
+        f"{bounce}." + (f" By default only: {join_names(partial, rows)}." if partial else "")
     )
 
 
 def draw_causes(causes):
-    """Draw the shares of the causes of MuJoCo's cells that are not good, one bar for each."""
+    """Draw the shares of the causes of the cells that are not good: a panel for each column, a bar for each cell."""
     shown = [part for part in PARTS if any(abs(cell[part]) >= 0.005 for cell in causes)]
-    figure = Figure(figsize=(11, 0.22 * len(causes) + 1.2), layout="constrained")
-    axes = figure.subplots()
+    columns = COLUMNS[:2]
+    cells = {
+        column: [cell for cell in causes if (cell["level"], cell["rate"]) == column]
+        for column in columns
+    }
+    longest = max(map(len, cells.values()))
+    figure = Figure(figsize=(13, 0.17 * longest + 1.2), layout="constrained")
     colors = mpl.colormaps["tab10"].colors
-    for i, cell in enumerate(causes):
-        ends = {1: 0.0, -1: 0.0}
-        for part in shown:
-            share = cell[part]
-            side = 1 if share >= 0 else -1
-            axes.barh(i, share, left=ends[side], height=0.8, color=colors[PARTS.index(part)])
-            ends[side] += share
-    labels = [
-        f"{ENGINES[c['engine']].title}, {c['level']}: {c['scene']}, {c['error']:.2g} {SCENES[c['scene']].unit}"
-        for c in causes
-    ]
-    axes.set_yticks(range(len(causes)), labels, fontsize=8)
-    axes.set(
-        xlim=CAUSES_RANGE,
-        ylim=(len(causes) - 0.4, -0.6),
-        xlabel="share of the difference to the rigid laws [-]; bars that reach the border are longer",
-    )
-    axes.axvline(0.0, color="k", lw=0.8)
-    axes.axvline(1.0, color="k", lw=0.8, ls=":")
+    for axes, column in zip(figure.subplots(1, 2), columns, strict=True):
+        for i, cell in enumerate(cells[column]):
+            ends = {1: 0.0, -1: 0.0}
+            for part in shown:
+                share = cell[part]
+                side = 1 if share >= 0 else -1
+                axes.barh(i, share, left=ends[side], height=0.8, color=colors[PARTS.index(part)])
+                ends[side] += share
+        labels = [
+            f"{ENGINES[c['engine']].title}: {c['scene']}, {c['error']:.2g} {SCENES[c['scene']].unit}"
+            for c in cells[column]
+        ]
+        axes.set_yticks(range(len(labels)), labels, fontsize=7)
+        axes.set(
+            xlim=CAUSES_RANGE,
+            ylim=(longest - 0.4, -0.6),
+            xlabel="share of the difference to the rigid laws [-]; a bar that reaches the border is longer",
+            title=write_column(column),
+        )
+        axes.axvline(0.0, color="k", lw=0.8)
+        axes.axvline(1.0, color="k", lw=0.8, ls=":")
     handles = [mpl.patches.Patch(color=colors[PARTS.index(part)], label=part) for part in shown]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(shown), fontsize=8)
     return figure
 
 
+def get_main_part(cell):
+    """Return the part with the largest share of a cell."""
+    return max(PARTS, key=lambda part: abs(cell[part]))
+
+
 def make_causes(causes):
-    """Return the sentences on the causes of MuJoCo's cells."""
-    solver = max(causes, key=lambda cell: abs(cell["solver"]))
+    """Return the sentences on the causes of cells that are not good."""
+    engines = dict.fromkeys(ENGINES[cell["engine"]].title.split(" (")[0] for cell in causes)
+    by_solver = {}
+    for cell in causes:
+        if abs(cell["solver"]) >= LARGE_SHARE:
+            title = ENGINES[cell["engine"]].title.split(" (")[0]
+            by_solver[title] = by_solver.get(title, 0) + 1
+    solver = ", ".join(f"{title} {count}" for title, count in by_solver.items())
     stick = next(
         c for c in causes if (c["engine"], c["level"], c["scene"]) == ("mujoco", "default", "stick")
     )
     parts = ", ".join(f"{part} {stick[part]:+.2f}" for part in PARTS if abs(stick[part]) >= 0.005)
-    timed = sorted({cell["scene"] for cell in causes if cell["time step"] == 1.0})
-    assert abs(solver["solver"]) < 0.1, "the sentence on better solvers is not true"
-    return (
-        f"Of {len(causes)} cells the solver's share is at most {abs(solver['solver']):.0%}: a better solver changes "
-        f"none of them. MuJoCo's slab of `stick` is {parts}. Steps of {join_scenes(timed)} are rigid ones: "
-        "their error is the time step's."
+    counts = {part: sum(get_main_part(cell) == part for cell in causes) for part in PARTS}
+    largest = ", ".join(
+        f"{part} {count}"
+        for part, count in sorted(counts.items(), key=lambda item: -item[1])
+        if count
     )
-
-
-def join_scenes(names):
-    """Return names of scenes as text."""
-    return " and ".join(filter(None, (", ".join(f"`{n}`" for n in names[:-1]), f"`{names[-1]}`")))
+    return (
+        f"{len(causes)} cells of {len(engines)} engines ({', '.join(engines)}), by the largest share: {largest}. The "
+        f"solver's share is {LARGE_SHARE:.0%} or more in {sum(by_solver.values())} of them ({solver}): a better solver "
+        f"changes none of the others. MuJoCo's slab of `stick` is {parts}."
+    )
 
 
 def make_tables(rows):

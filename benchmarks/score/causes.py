@@ -1,6 +1,9 @@
-"""Whose error a cell of MuJoCo is: parts of the difference to the rigid laws, summed over steps of the run.
+"""Whose error a cell is: parts of the difference to the rigid laws, summed over steps of the run.
 
-    python -m benchmarks.score.causes
+    python -m benchmarks.score.causes mjx
+
+divides the cells of the rows of engines that are named, of all of `ROWS` without a name, in the environment of the
+engine, which needs lavender too; cells of other engines stay in the file.
 
 `lavender.compare` divides the velocity change of one step that a rigid step would not make into solver, integrator,
 softness and friction (cone and law). At N_SAMPLES states of a run, the parts of the velocities of bodies, or of hinges
@@ -9,19 +12,23 @@ if there are only hinges, are added up and projected on the direction of the sum
     share(part) = sum_k part_k . D / sum_k total_k . D      D = sum_k total_k
 
 so that shares sum to 1. Each step starts from the engine's own state: an error that grows by itself counts where it is
-made. If no step differs from the rigid one, the error is of the time step alone. RK4 has no single step to divide.
+made. If no step differs from the rigid one, the error is of the time step alone: of positions that follow velocities,
+of the order of events within a step. RK4 has no single step to divide. LavenderSim's steps are read as problems, in
+which gravity and gyroscopic torque have acted already: its integrator counts as time step.
 """
 
 from __future__ import annotations
 
 import csv
+import importlib
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.score.adapters import CannotExpress
-from benchmarks.score.adapters.mjcf import get_start, make_xml
+from benchmarks.score.adapters import CannotExpress, Running
 from benchmarks.score.records import Record, read_records
 from benchmarks.score.run import COLUMNS, get_settings, get_settings_key
 from benchmarks.score.scenes import SCENES, Description, classify
@@ -31,8 +38,22 @@ from lavender.base.errors import LavenderError
 from lavender.io.stored import write_text
 
 PATH = Path(__file__).with_name("causes.csv")
-ROWS = ("mujoco", "mujoco-noslip", "mujoco-soft", "mujoco-pgs")
+#: Rows whose steps can be read. Those of MuJoCo that differ in accurate settings only have no cells by default.
+ROWS = (
+    "lavender",
+    "mujoco",
+    "mujoco-noslip",
+    "mujoco-soft",
+    "mujoco-exact",
+    "mujoco-pgs",
+    "mjx",
+    "newton-mujoco",
+    "genesis",
+)
+ACCURATE_ONLY = ("mujoco-noslip", "mujoco-soft", "mujoco-exact")
 N_SAMPLES = 40  # steps of a simulation that are divided
+#: m/s; smaller mean differences of a step are rounding, or the compliance of the rigid twin.
+ROUNDING = {"float64": 1e-6, "float32": 1e-5}
 #: Parts of `lavender.compare` -> those of the page. A part of friction is "cone" or "law".
 NAMES = {
     "solver": "solver",
@@ -47,51 +68,45 @@ PARTS = (*dict.fromkeys(NAMES.values()), "rest", "time step")
 
 
 class Sampler:
-    """Simulates scenes in MuJoCo and adds up the parts of the steps that it divides."""
+    """Simulates scenes in an engine and adds up the parts of the steps that it divides."""
 
-    def __init__(self, options: dict[str, Any]) -> None:
-        self.options = options
+    def __init__(self, build: Callable[..., Running], options: dict[str, Any]) -> None:
+        self.build, self.options = build, options
         self.parts: list[dict[str, FloatArray]] = []
+        self.rounding = 0.0
         self.unsolved = 0
 
     def run(self, scene: Description, dt: float, every: float) -> tuple[FloatArray, FloatArray]:
         """Simulate a scene; see `scenes.Run`."""
-        import mujoco
-
-        from benchmarks.score.adapters.mujoco_c import build
-
-        engine = build(scene, {"dt": dt, **self.options})
-        settings = {k: v for k, v in self.options.items() if k != "hard"}
-        text = make_xml(scene, dt, settings, "hard" in self.options)
-        model = mujoco.MjModel.from_xml_string(text)
-        data = mujoco.MjData(model)
-        velocity, forces, control = get_start(scene)
-        data.qvel[:], data.ctrl[:] = velocity, control
-        data.xfrc_applied[1 : len(forces) + 1, :3] = forces
+        engine = self.build(scene, {"dt": dt, **self.options})
+        assert engine.read_step is not None
         total = round(scene["seconds"] / dt)
         between = max(1, round(every / dt))
         sampled = set(np.linspace(0, total - 1, N_SAMPLES).astype(int).tolist())
         states = [np.array(engine.get_state(), float)]
         for k in range(total):
             if k in sampled:
-                self._divide(model, data)
-            engine.step()
-            mujoco.mj_step(model, data)
+                self._divide(engine.read_step())
+            else:
+                engine.step()
             if (k + 1) % between == 0 or k + 1 == total:
                 states.append(np.array(engine.get_state(), float))
         t = np.array([*range(0, total, between), total], float) * dt
+        engine.close()
         return t, np.array(states)
 
-    def _divide(self, model: Any, data: Any) -> None:
-        """Add the parts of the next step."""
+    def _divide(self, record: Any) -> None:
+        """Add the parts of a step."""
         import lavender
-        from lavender.io import step_from_mujoco
 
+        if record is None:
+            return
         try:
-            found = lavender.compare(step_from_mujoco(model, data))
+            found = lavender.compare(record)
         except LavenderError:
             self.unsolved += 1
             return
+        self.rounding = ROUNDING[record.precision]
         angular = np.asarray(found.a.angular, bool)
         moves = angular if angular.all() else ~angular  # of hinges, or of bodies
         parts = dict.fromkeys(PARTS, np.zeros(int(moves.sum())))
@@ -108,7 +123,7 @@ class Sampler:
         sums = {name: sum(parts[name] for parts in self.parts) for name in (self.parts or [{}])[0]}
         whole = sums.get("total", np.zeros(1))
         size = float(whole @ whole)
-        if size <= 1e-20 * max(1, len(self.parts)) ** 2:  # (m/s)^2: rounding of each step
+        if size <= (self.rounding * len(self.parts)) ** 2:
             shares["time step"] = 1.0
             return shares
         for name in PARTS:
@@ -121,20 +136,24 @@ def measure_causes(
 ) -> tuple[float, dict[str, float], int]:
     """Return error and shares of a cell, and the number of steps that were divided."""
     level, rate = column
-    sampler = Sampler(get_settings(ENGINES[name], level))
+    entry = ENGINES[name]
+    build = importlib.import_module(f"benchmarks.score.adapters.{entry.adapter}").build
+    sampler = Sampler(build, get_settings(entry, level))
     found = SCENES[scene].measure(sampler.run, 1.0 / rate)
     error = found[0] if isinstance(found, tuple) else found
     return error, sampler.get_shares(), len(sampler.parts)
 
 
-def list_cells(rows: dict[tuple[str, str, int, str], Record]) -> list[Record]:
-    """Return the cells of MuJoCo with one simulation that are not good at 1/240 s."""
+def list_cells(
+    rows: dict[tuple[str, str, int, str], Record], names: Sequence[str] = ROWS
+) -> list[Record]:
+    """Return the cells of some rows with one simulation that are not good at 1/240 s."""
     return [
         row
         for row in rows.values()
-        if row.engine in ROWS and (row.level, row.rate) in COLUMNS[:2]
+        if row.engine in names and (row.level, row.rate) in COLUMNS[:2]
         if not row.note and not SCENES[row.scene].curve and classify(row.scene, row.error) > 0
-        if row.level == "accurate" or row.engine in ("mujoco", "mujoco-pgs")
+        if row.level == "accurate" or row.engine not in ACCURATE_ONLY
     ]
 
 
@@ -148,21 +167,32 @@ def read_causes(path: Path = PATH) -> list[dict[str, Any]]:
     return rows
 
 
-def main() -> None:
-    """Divide all cells and write the file."""
+def write_causes(cells: Sequence[dict[str, Any]], path: Path = PATH) -> None:
+    """Write the cells, sorted."""
     head = ("engine", "level", "rate", "scene", "settings", "error", "steps", *PARTS)
-    lines = [",".join(head)]
-    for row in sorted(list_cells(read_records()), key=lambda row: row.key):
+    digits = {"error": ".4g"} | dict.fromkeys(PARTS, ".4f")
+    lines = [",".join(format(cell[key], digits.get(key, "")) for key in head) for cell in cells]
+    write_text(path, "\n".join([",".join(head), *sorted(lines)]) + "\n")
+
+
+def main(names: Sequence[str]) -> None:
+    """Divide the cells of some rows, and keep the others of the file."""
+    names = names or ROWS
+    kept = [cell for cell in read_causes() if cell["engine"] not in names]
+    for row in sorted(list_cells(read_records(), names), key=lambda row: row.key):
+        column = (row.level, row.rate)
         try:
-            error, shares, steps = measure_causes(row.engine, (row.level, row.rate), row.scene)
+            error, shares, steps = measure_causes(row.engine, column, row.scene)
         except CannotExpress:
             continue
-        values = [f"{error:.4g}", str(steps), *(f"{shares[name]:.4f}" for name in PARTS)]
         settings = get_settings_key(ENGINES[row.engine], row.level)
-        lines.append(",".join([row.engine, row.level, str(row.rate), row.scene, settings, *values]))
-        print(lines[-1], row.error, flush=True)
-    write_text(PATH, "\n".join(lines) + "\n")
+        cell = {"engine": row.engine, "level": row.level, "rate": row.rate, "scene": row.scene}
+        cell |= {"settings": settings, "error": error, "steps": steps, **shares}
+        kept.append(cell)
+        write_causes(kept)
+        print(cell, row.error, flush=True)
+    write_causes(kept)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

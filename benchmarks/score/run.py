@@ -15,7 +15,7 @@ import click
 from benchmarks.output import markdown
 from benchmarks.score.adapters import CannotExpress
 from benchmarks.score.records import PATH, Record, read_records, write_records
-from benchmarks.score.scenes import SCENES, classify
+from benchmarks.score.scenes import SCENES, classify, count_steps
 from benchmarks.score.settings import ENGINES, Entry
 from benchmarks.score.simulate import (
     Failed,
@@ -62,7 +62,7 @@ def measure_cell(
     curve = ""
     residual = math.nan
     for _ in range(runs):
-        simulator.start_cell()
+        simulator.start_cell(count_steps(scene, 1.0 / rate))
         try:
             found = SCENES[scene].measure(simulator.run, 1.0 / rate)
         except CannotExpress as error:

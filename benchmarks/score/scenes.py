@@ -514,3 +514,21 @@ SCENES: Mapping[str, Scene] = {
 def classify(scene: str, error: float) -> int:
     """Return the class of an error: 0 good, 1 fair, 2 poor, 3 wrong."""
     return sum(not error <= limit for limit in SCENES[scene].limits)
+
+
+def count_steps(scene: str, dt: float) -> int:
+    """Return the number of steps of a cell at a time step [s], of all its simulations."""
+    total = 0
+
+    def rest(description: Description, dt: float, every: float) -> tuple[FloatArray, FloatArray]:
+        nonlocal total
+        total += round(description["seconds"] / dt)
+        t = np.append(np.arange(0.0, description["seconds"], every), description["seconds"])
+        keys = ("position", "quaternion", "velocity", "spin")
+        state = [
+            [x for key in keys for x in b[key]] for b in description["bodies"] if b["mass"] > 0
+        ]
+        return t, np.tile(np.array(state), (len(t), 1, 1))
+
+    SCENES[scene].measure(rest, dt)
+    return total

@@ -69,6 +69,7 @@ class Entry:
 
 
 NO_KNOB = "no such setting"
+_GPU = 5.0  # patience with engines whose step on a CPU takes milliseconds because they are made for GPUs
 
 
 def _make_mujoco(title: str, common: Options, **replaced: Knob | None) -> Entry:
@@ -77,12 +78,14 @@ def _make_mujoco(title: str, common: Options, **replaced: Knob | None) -> Entry:
         "iterations": Knob(
             "iterations",
             {"iterations": 500, "tolerance": 1e-12},
-            "Modeling, Solver settings: very small tolerance",
+            "Modeling, Solver settings: very small tolerance; ls_iterations 500 and ls_tolerance 1e-12 change no "
+            "cell of MuJoCo (Newton) by more than 1 %",
         ),
         "stiffness": Knob(
             "stiffness",
             {"hard": True},
-            "Modeling, Solver parameters: solref at least 2 dt; solimp to 0.9999",
+            "Modeling, Solver parameters: solref at least 2 dt; solimp to 0.9999. diagexact, which the XML reference "
+            "offers for models with complex kinematic coupling, has a row",
         ),
         "friction": Knob(
             "friction",
@@ -97,7 +100,7 @@ def _make_mujoco(title: str, common: Options, **replaced: Knob | None) -> Entry:
         "integration": Knob(
             "integration",
             {"integrator": "implicit"},
-            "Computation, Integrators: implicit for coupled rotation",
+            "Computation, Integrators: implicit for coupled rotation; discrete is for stiff springs and dampings",
         ),
     }
     unset = {
@@ -153,10 +156,15 @@ def _make_dart(title: str, common: Options, sweeps: bool) -> Entry:
     return Entry(title, "dart", "dart", ("dartpy==6.20.0", "numpy"), knobs, unset, common)
 
 
-def _make_drake(title: str, common: Options) -> Entry:
+def _make_drake(title: str, common: Options, approximation: str = "kLagged") -> Entry:
     """Return a row of Drake."""
     knobs = (
-        Knob("stiffness", {"penetration": 1e-5}, "MultibodyPlant: set_penetration_allowance")
+        Knob(
+            "stiffness",
+            {"penetration": 1e-5},
+            "AddContactMaterial: point_stiffness, here the weight of the heaviest body per allowed penetration and at "
+            "least the shipped 1e6 N/m; set_sap_near_rigid_threshold is for kSap",
+        )
         if not common
         else Knob(
             "stiffness",
@@ -166,8 +174,9 @@ def _make_drake(title: str, common: Options) -> Entry:
         Knob("slip", {"stiction": 1e-5}, "MultibodyPlant: set_stiction_tolerance"),
         Knob(
             "integration",
-            {"approximation": "kLagged"},
-            "DiscreteContactApproximation: kLagged for gliding at low speed",
+            {"approximation": approximation},
+            "DiscreteContactApproximation: kLagged is preferred, and kSimilar for strong transients"
+            + ("" if common else "; of point contacts kSimilar does not converge"),
         ),
     )
     unset = {
@@ -226,15 +235,19 @@ def _make_rapier(title: str, common: Options, substeps: int) -> Entry:
         Knob(
             "stiffness",
             {"frequency": (substeps or shipped) / 8},
-            "IntegrationParameters: contact_natural_frequency, here in 1/dt",
+            "IntegrationParameters: contact_natural_frequency, here in 1/dt; the package of npm has no setting of the "
+            "damping ratio, and none of contacts with fixed bodies",
         ),
         Knob(
-            "margin", {"allowedError": 1e-5}, "IntegrationParameters: normalizedAllowedLinearError"
+            "margin",
+            {"allowedError": 1e-5},
+            "IntegrationParameters: normalizedAllowedLinearError; the package of npm has no contact_recycling",
         ),
         Knob("sleep", {"sleep": False}, "RigidBodyDesc.setCanSleep"),
     )
     unset = {
-        "friction": "one point for each manifold; the choice FrictionModel::Coulomb is missing in the package of npm",
+        "friction": "one point and one twist for each manifold; the choice FrictionModel::Coulomb is missing in the "
+        "package of npm",
         "slip": NO_KNOB,
         "damping": "0 as shipped",
         "integration": NO_KNOB,
@@ -276,7 +289,7 @@ def _make_newton(
     solver: str,
     knobs: tuple[Knob, ...],
     unset: Mapping[str, str],
-    packages: tuple[str, ...] = _NEWTON,
+    patience: float = _GPU,
 ) -> Entry:
     """Return a row of newton."""
     shared = {
@@ -288,7 +301,14 @@ def _make_newton(
     }
     shared = {kind: why for kind, why in shared.items() if kind not in [k.kind for k in knobs]}
     return Entry(
-        title, "newton", "newton_warp", packages, knobs, shared | unset, {"solver": solver}
+        title,
+        "newton",
+        "newton_warp",
+        _NEWTON,
+        knobs,
+        shared | unset,
+        {"solver": solver},
+        patience=patience,
     )
 
 
@@ -332,6 +352,15 @@ ENGINES: Mapping[str, Entry] = {
         ),
     ),
     "mujoco-soft": _make_mujoco("MuJoCo (soft contacts)", {}, stiffness=None),
+    "mujoco-exact": _make_mujoco(
+        "MuJoCo (diagexact)",
+        {},
+        stiffness=Knob(
+            "stiffness",
+            {"hard": True, "diagexact": "enable"},
+            "as in MuJoCo (Newton); XML reference, flag diagexact: a more accurate impedance",
+        ),
+    ),
     "mujoco-rk4": _make_mujoco(
         "MuJoCo (RK4)",
         {},
@@ -383,6 +412,7 @@ ENGINES: Mapping[str, Entry] = {
     "dart-nsgs": _make_dart("DART (NSGS)", {"solver": "NsgsFrictionSolver"}, True),
     "drake": _make_drake("Drake (point contact)", {}),
     "drake-hydro": _make_drake("Drake (hydroelastic)", {"hydroelastic": 0.1}),
+    "drake-similar": _make_drake("Drake (kSimilar)", {"hydroelastic": 0.1}, "kSimilar"),
     "physx": Entry(
         "PhysX 5 (sapien)",
         "physx",
@@ -441,7 +471,7 @@ ENGINES: Mapping[str, Entry] = {
         {
             "substeps": "collision steps divide the time step",
             "stiffness": _RIGID,
-            "friction": NO_KNOB,
+            "friction": "one point and one twist for each manifold, release notes; " + NO_KNOB,
             "slip": NO_KNOB,
         },
         node=True,
@@ -689,6 +719,7 @@ ENGINES: Mapping[str, Entry] = {
             "friction": "a round cone at each point as shipped",
             "slip": NO_KNOB,
         },
+        patience=1.0,
     ),
     "newton-vbd": _make_newton(
         "newton (VBD)",
@@ -739,7 +770,7 @@ ENGINES: Mapping[str, Entry] = {
         "MuJoCo MJX",
         "mjx",
         "mjx_jax",
-        ("mujoco-mjx==4.0.0", "mujoco==4.0.0", "scipy"),
+        ("mujoco-mjx==3.17.0", "mujoco==3.17.0", "scipy"),
         (
             Knob(
                 "iterations",
@@ -757,6 +788,39 @@ ENGINES: Mapping[str, Entry] = {
             "sleep": "off as shipped",
             "damping": "0 as shipped",
         },
+        patience=_GPU,
+    ),
+    "genesis": Entry(
+        "Genesis",
+        "genesis",
+        "genesis_rigid",
+        ("genesis-world==1.4.5", "torch", "scipy"),
+        (
+            Knob(
+                "iterations",
+                {"iterations": 50, "tolerance": 1e-12, "ls_tolerance": 1e-12},
+                "RigidOptions: iterations, tolerance, ls_tolerance",
+            ),
+            Knob(
+                "stiffness",
+                {"constraint_timeconst": None},
+                "RigidOptions: None is as stiff as the time step allows",
+            ),
+            Knob(
+                "friction",
+                {"friction_cone": "elliptic"},
+                "RigidOptions: the exact isotropic cone, with impratio 100 and signorini",
+            ),
+            Knob("integration", {"precision": 64}, "genesis.init: precision of 64 bits"),
+        ),
+        {
+            "substeps": "as shipped; they divide the time step",
+            "slip": "impratio 100 comes with the elliptic cone; noslip is not supported with it",
+            "margin": "contact_pruning_tolerance is as shipped; no threshold of bounces",
+            "sleep": "off as shipped",
+            "damping": "0 as shipped",
+        },
+        patience=_GPU,
     ),
     "brax": Entry(
         "brax (positional)",
@@ -776,6 +840,7 @@ ENGINES: Mapping[str, Entry] = {
             "integration": NO_KNOB,
         },
         {"pipeline": "positional"},
+        patience=_GPU,
     ),
 }
 #: Engines that were tried and are not in the table, with the reason.

@@ -21,7 +21,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
 
 ROOT = Path(__file__).resolve().parents[2]
-MAX_REQUEST_TIME = 200.0  # s; a program that answers later is ended
+MAX_REQUEST_TIME = 900.0  # s; a program that answers later is ended
 MAX_RESIDUALS = 100  # residuals read in a scene
 PROPERTY_TOLERANCE = 1e-3  # relative; float32 and text formats
 
@@ -110,10 +110,11 @@ class Simulator:
         self.program: JsonLines | None = None
         self.start_cell()
 
-    def start_cell(self) -> None:
-        """Forget the CPU time, steps and residual of the scenes so far."""
+    def start_cell(self, expected: int = 0) -> None:
+        """Forget the CPU time, steps and residual of the scenes so far; `expected` is the number of steps to come."""
         self.cpu = 0.0
         self.steps = 0
+        self.expected = expected
         self.residual = float("nan")
 
     def run(self, scene: Description, dt: float, every: float) -> tuple[FloatArray, FloatArray]:
@@ -125,6 +126,7 @@ class Simulator:
         total = round(scene["seconds"] / dt)
         between = max(1, round(every / dt))
         more = {"limit": self.limit - self.cpu, "residuals": MAX_RESIDUALS if self.residuals else 0}
+        more["expected"] = max(total, self.expected - self.steps)
         told = self._request({"steps": total, "every": between, **more})
         self.cpu, self.steps = self.cpu + told["cpu"], self.steps + told["done"]
         if told.get("residual") is not None:

@@ -1,7 +1,8 @@
 """Step scenes in one engine, in the interpreter of its environment: python -m benchmarks.score.worker ADAPTER.
 
 It answers lines of JSON as benchmarks/engines/served.mjs does: {"scene", "options"} builds a scene, {"steps", "every",
-"limit"} makes steps. An answer has the CPU time and states, after building also the properties that the engine stores.
+"limit", "expected"} makes steps. An answer has the CPU time and states, after building also the properties that the
+engine stores.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Any
 from benchmarks.score.adapters import CannotExpress, Running
 
 CHUNK = 50  # steps between two looks at the CPU time
+PROBE = 100  # steps after which the rest is not made if it would take more than PROBE_EXCESS times the limit
+PROBE_EXCESS = 2.0
 
 
 def main(name: str) -> None:
@@ -38,7 +41,7 @@ def main(name: str) -> None:
                 if engine:
                     engine.close()
                 engine = create(request["scene"], request["options"])
-            answer = _advance(engine, request)
+            answer = advance(engine, request)
         except CannotExpress as error:
             answer = {"cannot": str(error)}
         except Exception as error:
@@ -47,11 +50,15 @@ def main(name: str) -> None:
         answers.flush()
 
 
-def _advance(engine: Any, request: dict[str, Any]) -> dict[str, Any]:
-    """Make steps, `every` of them between two states, until the CPU time is above `limit`; see `simulate`."""
+def advance(engine: Any, request: dict[str, Any]) -> dict[str, Any]:
+    """Make steps, `every` of them between two states, until the CPU time is above `limit`; see `simulate`.
+
+    `expected` is the number of steps that the cell still needs, these and those of later simulations.
+    """
     steps = request.get("steps", 0)
     every = request.get("every", 1)
     limit = request.get("limit", math.inf)
+    expected = request.get("expected", steps)
     done = 0
     cpu = 0.0
     residuals = []
@@ -63,6 +70,8 @@ def _advance(engine: Any, request: dict[str, Any]) -> dict[str, Any]:
             engine.step()
         cpu += process_time() - begin
         done += n
+        if done >= PROBE and cpu / done * expected > PROBE_EXCESS * limit:
+            break
         if done % every == 0 or done == steps:
             states.append(_read_state(engine))
             if len(residuals) < request.get("residuals", 0):

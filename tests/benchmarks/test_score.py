@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from benchmarks.score import scenes
+from benchmarks.score import scenes, worker
+from benchmarks.score.adapters import Running
 from benchmarks.score.causes import PARTS, list_cells, measure_causes, read_causes
 from benchmarks.score.records import read_records
 from benchmarks.score.run import (
@@ -256,8 +257,12 @@ def test_score_pages_have_the_tables_and_sentences_of_records_and_settings(drawi
             assert part in text, (page, name)
     settings = ROOT / "docs" / "static" / "scorecard" / "settings.csv"
     assert settings.read_text(encoding="utf-8") == drawing.make_settings_file()
-    assert {row.engine for row in rows.values()} == set(drawing.get_engines(rows))
-    assert len({ENGINES[name].engine for name in drawing.get_engines(rows)}) >= 19
+    by_default = drawing.get_engines(rows, COLUMNS[:1])
+    assert {row.engine for row in rows.values()} == set(by_default)
+    for column in COLUMNS[1:]:  # A column has been run as a whole, or not at all.
+        begun = {row.engine for row in rows.values() if (row.level, row.rate) == column}
+        assert begun <= set(drawing.get_engines(rows, (column,)))
+    assert len({ENGINES[name].engine for name in by_default}) >= 19
 
 
 def test_score_page_outside_of_computed_parts_has_no_number_of_an_engine():
@@ -403,6 +408,8 @@ def test_score_causes_are_of_the_records_and_sum_to_one(drawing):
     cells = {row.key: row for row in list_cells(rows)}
     found = {(c["engine"], c["level"], c["rate"], c["scene"]): c for c in causes}
     assert found.keys() == cells.keys()
+    # Several rows of one engine are one engine.
+    assert len({ENGINES[row.engine].engine for row in cells.values()}) >= 3
     for key, cell in found.items():
         assert cell["settings"] == cells[key].settings
         assert cell["error"] == pytest.approx(cells[key].error, rel=1e-3)
@@ -421,13 +428,50 @@ def test_score_cause_of_a_slab_on_a_pyramid_is_not_the_solver():
     assert shares["time step"] == 1.0
 
 
+def test_score_cause_of_a_heavy_box_in_lavender_sim_is_the_solver():
+    error, shares, steps = measure_causes("lavender", ("default", 240), "ratio")
+    row = read_records()["lavender", "default", 240, "ratio"]
+    assert steps == 40 and error == pytest.approx(row.error, rel=1e-3)
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert shares["solver"] == pytest.approx(
+        1.0, abs=1e-3
+    )  # Sweeps of a rigid problem with a round cone.
+
+
+def test_score_counts_the_steps_of_all_simulations_of_a_cell():
+    assert scenes.count_steps("stack", DT) == 5 * 240
+    assert scenes.count_steps("heading", DT) == len(scenes.HEADINGS) * 9 * 2 * 240
+    assert scenes.count_steps("ratios", DT) == len(scenes.RATIOS) * 3 * 240
+    # `rates` has rates of its own.
+    assert scenes.count_steps("rates", DT) == scenes.count_steps("rates", 1e-3) == sum(scenes.RATES)
+
+
+@pytest.mark.parametrize(
+    ("expected", "done"), [(2000, 2000), (3900, 2000), (4200, worker.PROBE), (10**6, worker.PROBE)]
+)
+def test_score_ends_a_cell_that_would_take_twice_its_limit(monkeypatch, expected, done):
+    now = [0.0]
+    steps = []
+
+    def step():
+        now[0] += 1e-3
+        steps.append(1)
+
+    monkeypatch.setattr(worker, "process_time", lambda: now[0])
+    engine = Running(step, lambda: [[0.0]], list)
+    asked = {"steps": 2000, "every": 1000, "limit": 2.0, "expected": expected}
+    answer = worker.advance(engine, asked)
+    assert answer["done"] == len(steps) == done
+    assert answer["cpu"] == pytest.approx(1e-3 * done)
+
+
 class Stub:
     """A simulator of known cost: each run takes two million steps of 3 µs, the engine's start 5 s."""
 
     def __init__(self):
         self.cpu, self.steps, self.residual, self.residuals = 5.0, 7, 1e-9, True
 
-    def start_cell(self):
+    def start_cell(self, expected=0):
         self.cpu = self.steps = 0
 
     def run(self, scene, dt, every):

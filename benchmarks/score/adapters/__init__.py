@@ -26,7 +26,7 @@ class Running:
     The state has 13 numbers of each moving body: position, quaternion w x y z, velocity, angular velocity (world).
     The properties are the values that the engine stores for each: mass, moments of inertia, friction and restitution
     of a contact of two such bodies; None if it cannot be read. The residual [m/s] is the judge's, if lavender reads
-    the engine.
+    the engine. `read_step`, if there is one, makes the next step and returns it as a `lavender.io.StepRecord`, or None.
     """
 
     step: Callable[[], Any]
@@ -34,6 +34,7 @@ class Running:
     get_properties: Callable[[], list[Any]]
     get_residual: Callable[[], float | None] = lambda: None
     close: Callable[[], Any] = lambda: None
+    read_step: Callable[[], Any] | None = None
 
 
 def get_moving(scene: Scene) -> list[dict[str, Any]]:

@@ -18,13 +18,13 @@ STEPS: dict[str, Any] = {}  # pipeline -> its compiled step
 def build(scene: Scene, options: Options) -> Running:
     """Use `step` of `options["pipeline"]`; the other options are fields of the system."""
     pipeline = importlib.import_module(f"brax.{options['pipeline']}.pipeline")
-    if scene["restitution"]:
-        raise CannotExpress("the elasticity of its materials is not read from MJCF")
     if any(any(b["force"]) for b in get_moving(scene)):
         raise CannotExpress("no external forces on bodies")
     if len(scene["joints"]) > len({joint["b"] for joint in scene["joints"]}):
         raise CannotExpress("no loops")
     system = mjcf.loads(make_xml(scene, options["dt"], {}))
+    elasticity = np.full_like(system.elasticity, scene["restitution"])
+    system = system.replace(elasticity=elasticity)
     replaced = {key: value for key, value in options.items() if key not in ("dt", "pipeline")}
     system = system.replace(**replaced) if replaced else system
     velocity, _, control = get_start(scene)
@@ -51,6 +51,8 @@ def build(scene: Scene, options: Options) -> Running:
     def properties() -> list[Any]:
         mass, inertia = np.array(system.link.inertia.mass), np.array(system.link.inertia.i)
         friction = np.array(system.geom_friction)[-len(mass) :, 0]
-        return [[m, *np.diag(i), f, None] for m, i, f in zip(mass, inertia, friction, strict=True)]
+        e = np.array(system.elasticity)[-len(mass) :]
+        rows = zip(mass, inertia, friction, e, strict=True)
+        return [[m, *np.diag(i), f, x] for m, i, f, x in rows]
 
     return Running(step, state, properties)

@@ -15,11 +15,17 @@ import pydrake.all as drake  # noqa: E402
 
 logging.getLogger("drake").setLevel(logging.ERROR)
 
-SHIPPED_MODULUS = 1e7  # Pa; hydroelastic_modulus of DefaultProximityProperties
+#: Of DefaultProximityProperties.
+SHIPPED_MODULUS = 1e7  # Pa
+SHIPPED_STIFFNESS = 1e6  # N/m
 
 
 def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
-    """Use `AdvanceTo`; options are `approximation`, `stiction` [m/s] and `hydroelastic`, a mesh resolution."""
+    """Use `AdvanceTo`.
+
+    Options are `approximation`, `stiction` [m/s], `penetration` of a point contact by its weight [m], `hydroelastic`, a
+    mesh resolution, and `modulus` [Pa].
+    """
     if scene["restitution"]:
         raise tools.CannotExpress(
             "no restitution coefficient, only dissipation or a relaxation time"
@@ -37,15 +43,16 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         )
     if "stiction" in options:
         plant.set_stiction_tolerance(options["stiction"])
-    if "penetration" in options:
-        plant.set_penetration_allowance(options["penetration"])
+    stiffness = None
+    if "penetration" in options:  # of the heaviest body's weight
+        weight = np.linalg.norm(scene["gravity"]) * max(b["mass"] for b in moving)
+        stiffness = max(weight / options["penetration"], SHIPPED_STIFFNESS)
 
     def add_shape(body: Any, shape: Any, name: str, size: float, rigid: bool) -> None:
         made = drake.ProximityProperties()
         fine = options.get("hydroelastic")
-        drake.AddContactMaterial(
-            friction=drake.CoulombFriction(scene["friction"], scene["friction"]), properties=made
-        )
+        friction = drake.CoulombFriction(scene["friction"], scene["friction"])
+        drake.AddContactMaterial(point_stiffness=stiffness, friction=friction, properties=made)
         if fine and rigid:
             drake.AddRigidHydroelasticProperties(size, made)
         elif fine:
@@ -91,9 +98,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         if i not in links:
             pose = drake.RigidTransform(drake.Quaternion(b["quaternion"]), b["position"])
             plant.SetFreeBodyPose(context, body, pose)
-            plant.SetFreeBodySpatialVelocity(
-                body, drake.SpatialVelocity(b["spin"], b["velocity"]), context
-            )
+            motion = drake.SpatialVelocity(b["spin"], b["velocity"])
+            plant.SetFreeBodySpatialVelocity(context, body, motion)
         if any(b["force"]):
             push = drake.ExternallyAppliedSpatialForce()
             push.body_index = body.index()

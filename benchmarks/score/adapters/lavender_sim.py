@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 import lavender as lv
 from benchmarks.score.adapters import Options, Running, Scene, get_moving, get_radius, has_ground
+from lavender.causes.problems import record_of_problem
 
 
 def build(scene: Scene, options: Options) -> Running:
@@ -36,7 +40,7 @@ def build(scene: Scene, options: Options) -> Running:
     sim = lv.Simulation(built)
     observed = [sim.reset()[0]]
 
-    def step() -> None:
+    def push() -> None:
         for i, b in enumerate(moving, first):
             if b["kinematic"]:
                 sim.set_velocity(i, b["velocity"] - gravity * dt)
@@ -44,7 +48,18 @@ def build(scene: Scene, options: Options) -> Running:
                 sim.set_velocity(
                     i, observed[0]["velocities"][i, :3] + np.array(b["force"]) * dt / b["mass"]
                 )
+
+    def step() -> None:
+        push()
         observed[0] = sim.step()[0]
+
+    def read_step() -> Any:
+        push()
+        problem = sim.constraint_problem()
+        observed[0] = sim.step()[0]
+        record = record_of_problem(problem, sim.state.a["impulse"][: problem.m].copy())
+        angular = np.tile([False] * 3 + [True] * 3, len(record.velocity) // 6)
+        return replace(record, angular=angular)
 
     def state() -> list[np.ndarray]:
         return list(
@@ -60,4 +75,7 @@ def build(scene: Scene, options: Options) -> Running:
             for b in sim.scene.bodies[first:]
         ]
 
-    return Running(step, state, properties, lambda: float(sim.residual()["velocity"]), sim.close)
+    def residual() -> float:
+        return float(sim.residual()["velocity"])
+
+    return Running(step, state, properties, residual, sim.close, read_step)

@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.score.adapters import CannotExpress, get_half, get_moving, get_radius, has_ground
 
+FLAGS = ("diagexact",)
 SHIPPED = 'friction="{} 0.005 0.0001"'
 
 
@@ -34,7 +35,10 @@ def make_contact(scene: dict[str, Any], dt: float, hard: bool) -> str:
 
 
 def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bool = False) -> str:
-    """Return the MJCF of a scene; `options` are attributes of `<option>`, `hard` is stiff contacts and loops."""
+    """Return the MJCF of a scene; `hard` is stiff contacts and loops.
+
+    `options` are attributes of `<option>`, `diagexact` one of its flags.
+    """
     loops = motors = ""
     moving = get_moving(scene)
     world = ""
@@ -73,10 +77,12 @@ def make_xml(scene: dict[str, Any], dt: float, options: dict[str, Any], hard: bo
             world = body + world
     ground = '<geom type="plane" size="0 0 1"/>' if has_ground(scene) else ""
     stiff = f'solref="{2 * dt!r} 1" solimp="0.99 0.9999 0.001"' if hard else ""
-    attributes = " ".join(f'{key}="{value}"' for key, value in options.items())
+    plain = {key: value for key, value in options.items() if key not in FLAGS}
+    attributes = " ".join(f'{key}="{value}"' for key, value in plain.items())
+    flags = "".join(f'<flag {key}="{options[key]}"/>' for key in FLAGS if key in options)
     return (
-        f'<mujoco><option timestep="{dt!r}" gravity="{join(scene["gravity"])}" {attributes}/>'
-        f"<default><geom {make_contact(scene, dt, hard)}/><equality {stiff}/></default>"
+        f'<mujoco><option timestep="{dt!r}" gravity="{join(scene["gravity"])}" {attributes}>'
+        f"{flags}</option><default><geom {make_contact(scene, dt, hard)}/><equality {stiff}/></default>"
         f"<worldbody>{ground}{world}</worldbody>"
         f"<equality>{loops}</equality><actuator>{motors}</actuator></mujoco>"
     )

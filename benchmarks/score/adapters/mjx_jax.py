@@ -52,4 +52,11 @@ def build(scene: Scene, options: Options) -> Running:
         friction = np.array(compiled.geom_friction)
         return [[mass[i], *inertia[i], friction[model.body_geomadr[i], 0], None] for i in ids]
 
-    return Running(step, state, properties)
+    def read_step() -> Any:
+        from lavender.io import step_from_mjx
+
+        before = data[0]
+        step()
+        return step_from_mjx(model, before, data[0])
+
+    return Running(step, state, properties, read_step=read_step)

@@ -53,4 +53,14 @@ def build(scene: Scene, options: Options) -> Running:
             return float(judge(from_mujoco(model, now), impulse(model, now)).velocity)
         return None
 
-    return Running(lambda: mujoco.mj_step(model, data), state, properties, residual)
+    def read_step() -> Any:
+        from lavender.io import step_from_mujoco
+
+        record = step_from_mujoco(model, data)
+        mujoco.mj_step(model, data)
+        return record
+
+    def step() -> None:
+        mujoco.mj_step(model, data)
+
+    return Running(step, state, properties, residual, read_step=read_step)

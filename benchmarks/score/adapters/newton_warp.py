@@ -109,13 +109,13 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         if (
             kind == "SolverVBD" and belts.any()
         ):  # It takes the velocity of a kinematic body from its places.
-            time[0] += options["dt"]
             poses = now.body_q.numpy()
-            poses[belts, :3] = (places + time[0] * start[:, :3])[belts]
+            poses[belts, :3] = (places + (time[0] + options["dt"]) * start[:, :3])[belts]
             now.body_q.assign(poses)
         if contacts is not None:
             model.collide(now, contacts)
         solvers[0].step(now, then, control, contacts, options["dt"])
+        time[0] += options["dt"]
         states[:] = then, now
 
     def state() -> list[Any]:
@@ -127,6 +127,18 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
         friction, e = model.shape_material_mu.numpy(), model.shape_material_restitution.numpy()
         return [[m, *np.diag(i), friction[-1], e[-1]] for m, i in zip(mass, inertia, strict=True)]
 
+    def read_step() -> Any:
+        solver = solvers[0]
+        if kind == "SolverKamino":
+            step()
+            return read_kamino(solver)
+        from lavender.io import step_from_newton_mujoco
+
+        before = [x.numpy().copy() for x in (solver.mjw_data.qpos, solver.mjw_data.qvel)]
+        is_first = time[0] == 0.0
+        step()
+        return None if is_first else step_from_newton_mujoco(solver, *before)
+
     saved = [[array.numpy().copy() for array in get_arrays(s)] for s in states]
     step()  # compiles
     for s, arrays in zip(states, saved[::-1], strict=True):
@@ -135,7 +147,21 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     states.reverse()
     solvers[0] = solver_class(model, **settings)  # forgets that step
     time[0] = 0.0
-    return tools.Running(step, state, properties)
+    readable = kind in ("SolverMuJoCo", "SolverKamino")
+    return tools.Running(step, state, properties, read_step=read_step if readable else None)
+
+
+def read_kamino(solver: Any) -> Any:
+    """Return the record of the last step of SolverKamino."""
+    from dataclasses import replace
+
+    from lavender.causes.problems import record_of_problem
+    from lavender.io import from_kamino
+
+    read = from_kamino(solver)
+    record = record_of_problem(read.batch[0], np.asarray(read.impulse, float)[: read.batch[0].m])
+    angular = np.tile([False] * 3 + [True] * 3, len(record.velocity) // 6)
+    return replace(record, angular=angular, precision="float32")
 
 
 def get_arrays(state: Any) -> list[Any]:
