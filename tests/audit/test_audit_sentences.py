@@ -1,15 +1,19 @@
 """Sentences of audits and of `tune` say what brute force over random tables finds."""
 
+import dataclasses
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from lavender.audit.pieces import AUDIT_VERDICTS, NOT_JUDGED
+from lavender.audit.pieces import AUDIT_VERDICTS, NOT_JUDGED, Prediction
 from lavender.audit.result import OUTCOMES, Audit
 from lavender.audit.settings import MujocoSetting as Setting
 from lavender.audit.simulated_worlds import Divergence, Runs
 from lavender.audit.tune import Measured, Tuning
+from lavender.causes.difference import Difference, Part
+from lavender.io.mujoco import PREDICTION_TOLERANCE
 from lavender.judge.residuals import AT_FLOOR, CLOSE, UNCONVERGED, WRONG
 from lavender.report.text import format_count, format_number, format_percent, format_speed
 
@@ -159,6 +163,77 @@ def check_claims(result, steps, text):
     assert words in text
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_shares_against_another_model_are_of_the_steps_that_both_judged(seed):
+    result, other = draw_audit(seed), draw_audit(seed)
+    rng = np.random.default_rng(seed)
+    other.runs = dataclasses.replace(other.runs, name="other")
+    other.numbers *= rng.choice([0.5, 1.0, 2.0], other.numbers.shape)
+    lost = rng.random(other.verdict.shape) < 0.3
+    other.verdict[lost], other.numbers[:, lost] = NOT_JUDGED, np.nan
+    result.against = other
+    own, its = (
+        {(w, s): e for w, s, e, v in list_steps(x) if v != "not judged"} for x in (result, other)
+    )
+    both = own.keys() & its.keys()
+    smaller, larger = (sum(f(own[x], its[x]) for x in both) for f in (float.__lt__, float.__gt__))
+    less, more = (format_percent(x, max(len(both), 1), 1) for x in (smaller, larger))
+    words = result.compare_in_words()
+    assert (
+        f"the same {format_count(len(both), 'state')}: the error is smaller in {less} of the"
+        in words
+    )
+    assert f"and larger in {more};" in words
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_predicted_velocities_are_compared_step_by_step(seed):
+    """The first step that moved unlike its answer, and the largest difference, whatever the pieces are."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 40))
+    world, step = rng.integers(0, 3, n), rng.permutation(n)
+    after = rng.normal(size=(n, 4)) * 10.0 ** rng.uniform(-3.0, 3.0, (n, 1))
+    predicted = after + rng.choice([0.0, 1e-12, 1e-3, 1.0], (n, 1)) * rng.normal(size=(n, 4))
+    predicted[rng.random(n) < 0.2] = np.nan
+    found = Prediction()
+    for part in np.array_split(np.arange(n), int(rng.integers(1, 4))):
+        found = found.merge(
+            Prediction.of_steps(predicted[part], after[part], world[part], step[part])
+        )
+    gaps = {
+        (int(w), int(s)): float(np.abs(p - a).max())
+        for w, s, p, a in zip(world, step, predicted, after, strict=True)
+        if not np.abs(p - a).max() <= PREDICTION_TOLERANCE * max(np.abs(p).max(), np.abs(a).max(), 1.0)
+        and np.isfinite(p).all()
+    }  # fmt: skip
+    assert found.steps == np.isfinite(predicted).all(axis=1).sum() and found.different == len(gaps)
+    assert found.largest == max(gaps.values(), default=0.0)
+    # Steps of a piece are in order, so that the first of each piece is its first one.
+    assert (found.first is None) == (not gaps) and (found.first is None or found.first in gaps)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_second_causes_are_those_whose_intervals_reach_the_first_one(seed):
+    rng = np.random.default_rng(seed)
+    still = SimpleNamespace(velocity_after=np.zeros(1), precision="float64")
+    parts = {}
+    for name in ("mass", "softness", "friction", "rest"):
+        changes = rng.choice([0.0, 1e-12, 1.0], p=[0.1, 0.1, 0.8]) * rng.normal(size=(4, 1))
+        parts[name] = Part(name, changes.mean(axis=0), changes, changes[0], changes[-1])
+    difference = Difference(still, still, parts, still, still, None)
+    row = np.ones(1)
+    ranked = sorted(parts.values(), key=lambda p: -abs(p.mean[0]))
+    ranked = [p for p in ranked if abs(p.mean[0]) > 1e-10]
+    expected = [p.name for p in ranked[:1]]
+    for part in ranked[1:]:
+        first, own = (np.sort(p.changes[:, 0]) for p in (ranked[0], part))
+        # The smallest size in the interval of the first cause, and the largest of the other one.
+        least = 0.0 if first[0] <= 0.0 <= first[-1] else np.abs(first).min()
+        if np.abs(own).max() >= least and abs(part.mean[0]) >= 0.1 * abs(ranked[0].mean[0]):
+            expected.append(part.name)
+    assert difference.list_causes(row) == expected
+
+
 # -- tune --------------------------------------------------------------------------------------------------------------
 
 
@@ -260,7 +335,16 @@ def check_headline(tuning, time, one, most, held, n):
         in own
     )
     if m is None:
-        assert first.startswith("Keep") and f"none of {n} settings" in first
+        assert first.startswith("Keep")
+        lost = [x for x in (tuning.closer, tuning.faster) if x is not None]
+        if tuning.error_limit is None and lost:
+            assert f"{lost[0].setting.short_name} has no gain on the worlds held back" in first
+            for x in lost:  # Neither is faster nor more accurate there.
+                h, own = held[x.setting], held[now.setting]
+                assert h.times.mean() >= 0.95 * own.times.mean()
+                assert max(h.error.max(), THRESHOLD) >= max(own.error.max(), THRESHOLD)
+        else:
+            assert f"none of {n} settings" in first
     else:
         ratio = time[m.setting] / time[now.setting]
         words = (
@@ -272,6 +356,10 @@ def check_headline(tuning, time, one, most, held, n):
         assert f"Set {m.setting.short_name}: {words}" in first and (
             f"{new} instead of {old}" in first
         ) == (new != old)
+        if tuning.error_limit is None and m.setting in held:  # A gain counts in the same worlds.
+            h, own = held[m.setting], held[now.setting]
+            is_faster = h.times.mean() < 0.95 * own.times.mean()
+            assert is_faster or max(h.error.max(), THRESHOLD) < max(own.error.max(), THRESHOLD)
         assert len(rest) == 1 + (
             m.setting in held
         )  # Errors on worlds held back may lead to a setting not timed there.

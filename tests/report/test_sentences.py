@@ -1,14 +1,17 @@
 """Sentences that recommend, count or blame say what brute force over the rows of random tables finds."""
 
+import json
 import math
 import re
 
 import numpy as np
 import pytest
 
+from lavender.report import Report
 from lavender.report.sweeps import SweepStudy
+from lavender.report.tables import read_engine_answers
 from lavender.report.text import format_speed, format_time
-from tests.report.synthetic import BUDGET, FALSE_CLAIM, record, report_of
+from tests.report.synthetic import BUDGET, FALSE_CLAIM, lines_of, record, report_of
 
 LIMIT = 1e-3
 PLAIN = ("pgs", "sequential_impulses", "block_gauss_seidel", "jacobi")
@@ -114,6 +117,60 @@ def test_recommended_sweeps_are_those_of_brute_force(seed):
             assert cold is None and f"{budgets[-1]} of {study.first} are not enough" in text
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_steps_that_do_not_count_are_counted_once(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(4, 9))
+    idle = set(rng.choice(n - 2, int(rng.integers(1, n - 2)), replace=False).tolist())
+    made = [
+        record(f"walk[{k}]", "pgs", 1e-3, 1e-4, **BUDGET | {"step": k, "velocity": 1e-4})
+        for k in range(n)
+    ]
+    facts = {f"walk[{k}]": {"nothing_to_do": True} for k in idle}
+    study = SweepStudy(report_of(*made, walk=True, cases=facts))
+    text = next(x for x in study.sentences if "recorded step" in x)
+    found = re.search(r"the zero impulse solves (\d+)", text)
+    assert (int(found[1]) if found else 0) == len(idle - {0})
+    counted = n - len(idle | {0})
+    assert f"Of {n} recorded steps" in text and f"compared on {counted}" in text
+
+
+# -- the answers of an engine ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sentences_on_the_engine_are_those_of_brute_force(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 8))
+    answers = [
+        {
+            "file": f"step_{k}.npz", "rows": 8, "seconds": 1e-3, "solver": "theirs", "verdict": "wrong",
+            "relative": float(10.0 ** rng.uniform(-8.0, 0.0)), "velocity": draw_error(rng),
+            "worst": f"row {k}", "energy_gain": float(rng.choice([-1.0, 0.0, 0.5, 2.0]) * rng.random()),
+        }
+        for k in range(n)
+    ]  # fmt: skip
+    (tmp_path / "engine.jsonl").write_text("\n".join(json.dumps(x) for x in answers) + "\n")
+    made = [record(f"case{k}", "pgs", 1e-3, 1e-8) for k in range(n)]
+    facts = {f"case{k}": {"source": str(tmp_path / f"step_{k}.npz")} for k in range(n)}
+    lines = lines_of(*made, cases=facts)
+    report = Report(lines, None, None, read_engine_answers([], lines))
+    text = " ".join(report.sentences)
+    worst = max(x["velocity"] for x in answers)
+    named = re.search(r"leaves up to (.+?) \(row (\d+)\), above (.+?) in (\d+) of", text)
+    assert answers[int(named[2])]["velocity"] == worst and named[1] == format_speed(worst)
+    assert int(named[4]) == sum(x["velocity"] > report.error_limit for x in answers)
+    gains = {f"case{k}": x["energy_gain"] for k, x in enumerate(answers) if x["energy_gain"] > 0.0}
+    told = [x for x in report.warnings if "your engine in" in x]
+    assert bool(told) == bool(gains)
+    if gains:
+        count, most, case = re.search(
+            r"your engine in (\d+) steps?, at most (\S+) J \((\w+)\)", told[0]
+        ).groups()
+        assert int(count) == len(gains) and gains[case] == max(gains.values())
+        assert float(most) == pytest.approx(max(gains.values()), rel=0.06)
+
+
 # -- the recommended solver --------------------------------------------------------------------------------------------
 
 TOL = 1e-6
@@ -146,7 +203,11 @@ def draw_runs(seed):
                     false.add(solver)
             made.append(record(case, solver, time, relative, **more))
             table[solver, case] = time if relative <= TOL else None
-    return report_of(*made), table, false
+    # The zero impulse solves this problem: neither its times nor its claims count.
+    for solver in solvers:
+        more = FALSE_CLAIM if rng.random() < 0.3 else {}
+        made.append(record("idle", solver, 10.0 ** rng.uniform(-5.0, 0.0), 1e-9, **more))
+    return report_of(*made, cases={"idle": {"nothing_to_do": True}}), table, false
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -184,3 +245,14 @@ def test_recommended_solver_is_that_of_brute_force(seed):
             and table[first, c] > 1.25 * table[name, c] and name not in false
         ]  # fmt: skip
         assert len(quicker) >= int(count) > 0
+    slower = {
+        c: table[first, c] / min(table[s, c] for s in solvers if table.get((s, c)) and s not in false | {first})
+        for c in cases if table.get((first, c))
+        and any(table.get((s, c)) for s in solvers if s not in false | {first})
+    }  # fmt: skip
+    counted = {c: x for c, x in slower.items() if x > 1.25}
+    assert ("On single problems" in text) == bool(counted)
+    if counted:
+        found = re.search(r"is then up to ([\d.]+)× slower \((\w+)\)", text)
+        assert counted[found[2]] == max(counted.values())
+        assert float(found[1]) == pytest.approx(max(counted.values()), rel=0.06)

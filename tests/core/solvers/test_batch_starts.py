@@ -82,6 +82,35 @@ def test_keys_map_starts_as_single_problems_do():
         assert lv.solve_many(after, impulse=solved).success.all()
 
 
+def test_starts_of_blocks_of_other_kinds_and_bounds_are_those_of_single_problems():
+    """A key may come back with another kind of block; bounds of new blocks may exclude 0 on both sides."""
+    rng = np.random.default_rng(3)
+
+    def draw_batch(n=40):
+        keys = [rng.choice(8, k, replace=False) for k in rng.integers(0, 5, n)]
+        cones = []
+        for own in keys:
+            parts = lv.Cones.bounded(np.zeros(0), np.zeros(0))
+            for _ in own:
+                low = float(rng.choice([-2.0, 0.0, 0.5]))
+                bounds = np.full(3, low), np.full(3, low + 1.0)
+                bounded = lv.Cones([0, 3], [0], *bounds, [0.0], [0.0])
+                parts += lv.Cones.contacts([0.5]) if rng.random() < 0.5 else bounded
+            cones.append(parts)
+        sizes = 3 * np.array([len(own) for own in keys])
+        return lv.Batch(
+            rng.standard_normal((sizes.sum(), 6)), np.broadcast_to(np.eye(6), (n, 6, 6)),
+            rng.standard_normal((n, 6)), row_ptr=np.concatenate([[0], np.cumsum(sizes)]), cones=cones,
+            compliance=np.full(sizes.sum(), 0.1), key=np.concatenate(keys).astype(np.uint64),
+        )  # fmt: skip
+
+    before, after = draw_batch(), draw_batch()
+    solved = lv.solve_many(before)
+    start = start_of(after, solved)
+    for i in range(len(after)):
+        np.testing.assert_array_equal(start[after.rows_of(i)], after[i].carry(solved[i]))
+
+
 def test_stacked_and_padded_batches_map_by_keys():
     rng = np.random.default_rng(0)
     jac = rng.standard_normal((3, 6, 6))

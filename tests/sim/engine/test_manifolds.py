@@ -13,18 +13,21 @@ def build_scene(name: str, **options) -> lv.Scene:
     scene.add_plane()
     rng = np.random.default_rng(7)
     kind, n = name.split()
+    bounces = options.get("restitution", 0.0) * np.array([0.0, 0.5, 1.0])
     for i in range(int(n)):
         if kind == "tower":
-            scene.add_box((1, 1, 1), position=(0, 0, i + 0.5))
+            scene.add_box((1, 1, 1), position=(0, 0, i + 0.5), restitution=bounces[i % 3])
         elif kind == "boxes":
             scene.add_box(
                 tuple(rng.uniform(0.3, 1.0, 3)),
                 position=(*rng.uniform(-1, 1, 2), 0.5 + 0.7 * i),
                 velocity=tuple(rng.normal(0, 3, 3)),
                 angular_velocity=tuple(rng.normal(0, 3, 3)),
+                restitution=bounces[i % 3],
             )
         elif kind == "spheres":
-            scene.add_sphere(0.3, position=(*rng.uniform(-1, 1, 2), 0.5 + 0.3 * i))
+            at = (*rng.uniform(-1, 1, 2), 0.5 + 0.3 * i)
+            scene.add_sphere(0.3, position=at, restitution=bounces[i % 3])
         else:
             for j in range(i, int(n)):
                 scene.add_box((1, 1, 1), position=(0.5 * i + j - i, 0, i + 0.5))
@@ -47,6 +50,9 @@ def run_in_lanes(scene: lv.Scene, lanes: int, calls: tuple[int, ...]) -> list[by
             seen.append(state.a[name][:contacts].tobytes())
         for name in ("impulse", "b", "d", "step", "inv_inertia_arm"):
             seen.append(state.a[name][:rows].tobytes())
+        seen.append(
+            state.a["setting"].tobytes()
+        )  # The statistics, such as the deepest penetration.
     return seen
 
 
@@ -74,6 +80,8 @@ def run_in_lanes(scene: lv.Scene, lanes: int, calls: tuple[int, ...]) -> list[by
         ("wall 6", {"recycle": 1e-3}),
         ("boxes 40", {"recycle": 1e-3}),
         ("boxes 20", {"recycle": 5e-3, "order": "given", "substeps": 3}),
+        ("tower 9", {"slop": 0.05, "restitution": 0.7, "restitution_threshold": 0.0}),
+        ("boxes 20", {"slop": 0.05, "restitution": 0.7, "restitution_threshold": 0.0}),
         ("boxes 30", {"friction": 0.0}),
         ("boxes 30", {"friction_shape": "box"}),
     ),
