@@ -680,3 +680,18 @@ def test_records_of_a_plug_in_with_changed_code_are_measured_again(tmp_path, mon
     assert machine.hash_solver_sources() == before
     path.write_text(path.read_text() + "# changed\n")
     assert machine.hash_solver_sources() != before
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("tol", (1e-3, 1e-6)), ("max_iter", (10, 20)), ("time_limit", (1.0, 2.0)), ("start", ("cold", "carried")),
+     ("mode", ("tol", "budget")), ("solver", ("pgs", "newton"))],
+)  # fmt: skip
+def test_runs_that_a_plan_can_tell_apart_are_two_runs(name, values):
+    from tests.report.synthetic import lines_of, record
+
+    own = {"solver": "pgs"}
+    made = [record("case", relative=1e-9, time=1e-3, **own | {name: value}) for value in values]
+    again = [record("case", relative=1e-8, time=1e-3, **own | {name: values[1]})]
+    found = select_runs(lines_of(*made, *again))
+    assert found[name].tolist() == list(values) and found["relative"].tolist() == [1e-9, 1e-8]

@@ -391,6 +391,31 @@ def test_gradients_of_worlds_equal_those_of_single_problems(law, contacts, nv, t
         assert np.array_equal(found[i].v_free, alone.v_free)
 
 
+def test_gradients_by_mu_of_worlds_with_unlike_patches_equal_those_of_single_problems():
+    """Each world has contacts of its own patch radii and ratios of boxes, in any number."""
+    rng = np.random.default_rng(4)
+    counts = [2, 1, 3, 2, 4]
+    cones = [
+        lv.Cones.contacts(rng.uniform(0.3, 0.8, k), patch_radius=rng.uniform(0.05, 0.5, k))
+        if k % 2 else lv.Cones.contacts(rng.uniform(0.3, 0.8, (k, 2)), shape="box")
+        for k in counts
+    ]  # fmt: skip
+    ptr = np.cumsum([0, *(c.n_rows for c in cones)])
+    batch = lv.Batch(
+        rng.standard_normal((ptr[-1], 24)), np.array([np.eye(24)] * 5), rng.standard_normal((5, 24)),
+        compliance=np.full(ptr[-1], 0.1), cones=cones, row_ptr=ptr,
+    )  # fmt: skip
+    solutions = lv.solve_many(batch, tol=1e-12)
+    velocity = rng.standard_normal(batch.velocity_shape)
+    found = lv.derivatives(batch, solutions).vjp(velocity=velocity).mu
+    alone = [
+        lv.derivative(batch[i], solutions[i]).vjp(velocity=np.reshape(velocity, (5, 24))[i]).mu
+        for i in range(5)
+    ]
+    np.testing.assert_array_equal(found, np.concatenate(alone))
+    assert np.abs(found).min() >= 0.0 and np.count_nonzero(found) > 5
+
+
 def test_gradients_of_worlds_agree_with_differences():
     batch = make_worlds("coulomb", 2, 6)
     y = np.random.default_rng(2).standard_normal((8, 6))

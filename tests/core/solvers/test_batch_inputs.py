@@ -96,3 +96,45 @@ def test_float32_floors_of_islands_are_those_of_a_batch(condition):
         assert one.above_floor <= one.relative
         several += len(one.islands.relative) > 1
     assert several == n
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_batch_refuses_asymmetric_masses_as_single_calls_do_in_any_unit(seed):
+    """Asymmetry is relative to the masses of both velocities, which may be far apart."""
+    rng = np.random.default_rng(seed)
+    unit = 10.0 ** rng.uniform(-4.0, 4.0, 3)
+    gap = 10.0 ** rng.uniform(-16.0, -3.0, 8)
+    masses = np.array([np.diag(unit**2)] * 8)
+    i, j = rng.permutation(3)[:2]
+    masses[:, i, j] += gap * unit[i] * unit[j]
+    jac, free = rng.standard_normal((8, 2, 3)) * unit, rng.standard_normal((8, 3)) / unit
+    bounds = {"cones": lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))}
+
+    def solve_one(k):
+        return lv.solve(lv.Problem.from_jacobian(jac[k], masses[k], free[k], **bounds))
+
+    many = lv.solve_many(lv.Batch(jac, masses, free, **bounds), errors="status")
+    refused = [is_refused(lambda k=k: solve_one(k)) for k in range(8)]
+    assert [k in many.faults for k in range(8)] == refused
+    for k in range(8):
+        assert refused[k] or many[k].impulse.tobytes() == solve_one(k).impulse.tobytes()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_worlds_whose_bounds_exclude_zero_have_the_numbers_of_single_calls(seed):
+    """From below and from above: the reference of the residual is that of the zero impulse within the bounds."""
+    rng = np.random.default_rng(seed)
+    low = rng.choice([-2.0, -0.5, 0.0, 0.3], (8, 3))
+    high = low + rng.choice([0.2, 1.0, np.inf], (8, 3))
+    arrays = rng.standard_normal((8, 3, 4)), np.array([np.eye(4)] * 8), rng.standard_normal((8, 4))
+    cones = [lv.Cones.bounded(*x) for x in zip(low, high, strict=True)]
+    jac, mass, free = arrays
+    batch = lv.Batch(jac.reshape(-1, 4), mass, free, cones=cones, row_ptr=3 * np.arange(9))
+    many = lv.solve_many(batch, tol=1e-9)
+    judged = lv.residual_many(batch, many.impulse)
+    for k in range(8):
+        one = lv.solve(lv.Problem.from_jacobian(jac[k], mass[k], free[k], cones=cones[k]), tol=1e-9)
+        assert many[k].impulse.tobytes() == one.impulse.tobytes()
+        for found in (many, judged):
+            assert found.relative[k] == one.residual.relative
+            assert found.velocity_at_zero[k] == one.residual.velocity_at_zero
