@@ -3,10 +3,10 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels gates test quick lint format types coverage docs wasm fingerprint ci nightly release clean
+.PHONY: help setup kernels gates test quick lint format types coverage kernel-coverage docs wasm fingerprint ci nightly release clean
 
 help:  ## list the commands
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 setup:  ## create a virtual environment with all development dependencies
 	python3 -m venv .venv
@@ -49,6 +49,9 @@ coverage:  ## measure the tests' line coverage of the Python files, in build/cov
 	$(PYTHON) -m coverage combine -q
 	$(PYTHON) -m coverage html -q -d build/coverage
 	$(PYTHON) -m coverage report | tail -n 1
+
+kernel-coverage:  ## list the lines of kernels and C headers that no test runs, in build/coverage/kernels.txt
+	$(PYTHON) .ci/kernel_coverage
 
 docs:  ## build the documentation, in site/
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs site

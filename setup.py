@@ -5,6 +5,7 @@ Environment:
     LAVENDER_DEBUG=1        check every index of every memoryview, -Og -g1
     LAVENDER_DEBUG=asan     the same with the address and undefined-behaviour sanitizers, which also check raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
+    LAVENDER_DEBUG=coverage processes count the lines of C that they run, for .ci/kernel_coverage (gcc, -Og)
     CYTHON_CACHE_DIR=D      cache translations in D by the hash of their sources, as ccache does for C
     LAVENDER_FILES_URL=U    base address of the files of this version: prefix of links and pictures in the long
                             description, since a package index shows only its text, and of the project's URLs
@@ -45,7 +46,9 @@ OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/sim/web/compile.py")
 put = WASM["write_atomically"]
 LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
-DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
+DIRECTIVES = OPTIONS["directives"](debug=DEBUG and MODE != "coverage")
+if MODE == "coverage":
+    DIRECTIVES["emit_code_comments"] = True  # They name the lines of the sources.
 #: Module with Cython's utility code (memoryviews), which would otherwise be half of the code of every module.
 SHARED = "lavender_ext._utility"
 
@@ -88,6 +91,9 @@ else:
         sanitizers += ["-fno-sanitize=null,object-size,pointer-overflow"]
         LINK_ARGS += sanitizers
         COMPILE_ARGS += [*sanitizers, "-fno-omit-frame-pointer"]
+    if MODE == "coverage":
+        LINK_ARGS.append("--coverage")
+        COMPILE_ARGS += ["--coverage", "-fprofile-update=atomic"]
 
 
 def is_part_of_cython(path):
