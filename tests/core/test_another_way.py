@@ -177,9 +177,7 @@ def limit_lanes(width):
 
     def make_worlds(*arguments):
         worlds = make(*arguments)
-        if worlds.width < width:
-            pytest.skip("this processor has fewer lanes")
-        worlds.width = width
+        worlds.width = min(width, worlds.width)
         return worlds
 
     with patch.object(Batch, "make_kernel_worlds", make_worlds):
