@@ -464,7 +464,7 @@ class Batch(Sequence[Problem]):
             key=self._get_keys_of_world(i) if named else None,
         )
         if i in self.engine_motions:
-            problem.set_record(EngineRecord(self.engine_motions[i]))
+            problem._set_record(EngineRecord(self.engine_motions[i]))
         return problem
 
     def _get_array_of_world(self, world: dict[str, int], which: int) -> Any:

@@ -157,7 +157,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         how = kept.mj, model, model.opt.integrator, step.is_discrete, is_stepped
         answer = partial(_make_motion, how, dt, blocks, arrays, compliance, momentum, is_stiff)
     source = EngineSource(weakref.ref(data), model, np.array(data.qvel), is_stepped)
-    problem.set_record(EngineRecord(answer, source, _predict_velocity))
+    problem._set_record(EngineRecord(answer, source, _predict_velocity))
     return problem
 
 

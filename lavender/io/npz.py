@@ -254,7 +254,7 @@ def _read_own_format(archive: Arrays) -> Stored:
             if name in archive or name in MOTION[:2]
         )
         answer = EngineMotion(moved, change, compliance, moved_by, *momentum)
-        problem.set_record(EngineRecord(answer))
+        problem._set_record(EngineRecord(answer))
     gap = _check_gap("entry 'gap'", archive["gap"], problem) if "gap" in archive else None
     return Stored(problem, "lavender", impulse=impulse, gap=gap)
 

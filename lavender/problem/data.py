@@ -454,7 +454,7 @@ class ProblemData:
         """The `answer` of `record`, a `lavender.io.engine_motion.EngineMotion`; None without one."""
         return None if self.record is None else self.record.answer
 
-    def set_record(self, record: EngineRecord) -> None:
+    def _set_record(self, record: EngineRecord) -> None:
         """Set `record`, for importers: nothing that is computed from the problem depends on it but `residual`."""
         self.__dict__["record"] = record
 
