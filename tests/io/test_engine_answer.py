@@ -153,7 +153,7 @@ def test_acceleration_of_an_island_is_compared_with_this_island_alone():
     )
     impulse = np.array([100.0, 0.5]) / 1.1
     answer = EngineMotion(impulse, impulse, problem.compliance, "acceleration")
-    problem._set_record(EngineRecord(answer))
+    vars(problem)["record"] = EngineRecord(answer)
     found = lv.residual(problem, impulse)
     assert found.moved_by == "acceleration"
     np.testing.assert_allclose((found.velocity, found.relative), 0.5 / 1.1, rtol=1e-9)
@@ -165,7 +165,9 @@ def test_solve_from_an_engines_forces_judges_forces_also_if_its_acceleration_is_
         np.eye(2), np.eye(2), [-3.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], np.inf)
     )
     exact = np.array([3.0, 1.0])
-    problem._set_record(EngineRecord(EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")))
+    vars(problem)["record"] = EngineRecord(
+        EngineMotion(0.5 * exact, exact, np.ones(2), "acceleration")
+    )
     assert lv.residual(problem, 0.5 * exact).relative < 1e-12
     solution = lv.solve(problem, impulse=0.5 * exact, tol=1e-9, **options)
     assert solution.success
