@@ -11,7 +11,6 @@ import click
 import numpy as np
 import pytest
 from calls import robot
-from mujoco_scene import scene
 from stacks import stack
 
 import lavender as lv
@@ -100,6 +99,8 @@ def options_of_real_numbers():
 @pytest.mark.parametrize("asked", ["nan", "-1"])
 @pytest.mark.parametrize(("command", "option"), list(options_of_real_numbers()))
 def test_command_with_nan_or_a_negative_number_ends_with_2(lavender, command, option, asked):
+    from mujoco_scene import scene
+
     with open("m.xml", "w") as file:
         file.write(scene())
     code, _, err = lavender(command, *RUNS[command], f"{option}={asked}")
