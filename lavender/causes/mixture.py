@@ -53,8 +53,8 @@ SOLVERS = ("newton", "auto")  # The second one solves if the first one does not 
 MAX_RESIDUAL = 1e-9  # [-] A mixture with a larger residual than this and its floor is not solved.
 # [-] The same with raised compliances: these change velocities by 1e-8 of themselves.
 MAX_RAISED_RESIDUAL = 1e-6
-# [-] An entry of the first three rows of a contact below this part of its column is rounding: they are three directions
-# of one point's velocity.
+# [-] The first three rows of a contact are the velocity of one point in three directions. An entry below this part of
+# its column is rounding.
 ROUNDING = 64.0 * np.finfo(float).eps
 
 

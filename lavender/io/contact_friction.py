@@ -1,4 +1,4 @@
-"""Friction coefficients of a MuJoCo contact by the contact's name, as MuJoCo combines those of its geoms."""
+"""Find the friction coefficients of a MuJoCo contact by its name; MuJoCo combines them from both geoms."""
 
 from __future__ import annotations
 

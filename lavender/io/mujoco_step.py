@@ -477,7 +477,7 @@ class StepReader:
         return groups
 
     def list_rows(self) -> Iterator[tuple[int, int, IntArray]]:
-        """Yield the kind of each constraint (mjtConstraint), its number among those of its kind, and its rows."""
+        """Yield each constraint's kind (mjtConstraint), its number among those of this kind, and its rows."""
         data = self.data
         i = 0
         while i < data.nefc:

@@ -104,7 +104,7 @@ class ProblemData:
     qp: Any = field(default=None, repr=False, compare=False)
     angular: Any = None
     derived: Derived = field(init=False, repr=False)
-    #: What the engine left beside this problem, if an importer made it.
+    #: The engine's answer to the step, if an importer made the problem.
     record: EngineRecord | None = field(default=None, init=False, repr=False, compare=False)
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What an engine leaves beside the problem of its step: its answer, the velocity this predicts, and its objects."""
+"""An engine's answer to the problem of its step, the velocity that it predicts, and the objects of the engine."""
 
 from __future__ import annotations
 

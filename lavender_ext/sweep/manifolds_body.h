@@ -190,7 +190,7 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax)(const lavender_group* g, const lavende
                                           const int32_t* at, double* x, lavender_four* own, lavender_four* va,
                                           lavender_four* vb) {
     const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
-    double *x0 = x + (x ? at[0] : 0), *x1 = x + (x ? at[1] : 0), *x2 = x + (x ? at[2] : 0), *x3 = x + (x ? at[3] : 0);
+    double *x0 = x ? x + at[0] : x, *x1 = x ? x + at[1] : x, *x2 = x ? x + at[2] : x, *x3 = x ? x + at[3] : x;
     lavender_four lam[4], minus_b[4], u[3], impulse[3], change[3];
     if (x) {
         LOAD_FOUR(x0, x1, x2, x3, lam);
@@ -250,15 +250,16 @@ ISA LAVENDER_INLINE_FOUR void FOUR(relax_group)(const lavender_group* g, const l
     FOUR(load_bodies)(v, g->read_b, vb);
     for (int j = 0; j < g->n; j++) {
         const int k = backwards ? g->n - 1 - j : j;
+        lavender_four* at = own ? own + 8 * k : own;
         if (k < g->n_all) {
-            FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, own + 8 * k, va, vb);
+            FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, at, va, vb);
             continue;
         }
         for (int i = 0; i < 6; i++) {
             old_a[i] = va[i];
             old_b[i] = vb[i];
         }
-        FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, own + 8 * k, va, vb);
+        FOUR(relax)(g, g->point + k, rows + k, g->contact[k], x, at, va, vb);
         const lavender_four_bits has = LAVENDER_HAS_POINT(g, k);
         for (int i = 0; i < 6; i++) {
             va[i] = LAVENDER_PICK_FOUR(has, va[i], old_a[i]);

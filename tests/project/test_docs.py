@@ -234,6 +234,17 @@ def test_every_test_that_a_page_names_exists():
             assert (ROOT / file).is_file(), f"{page.name} names {file}"
 
 
+def test_every_module_that_a_page_asks_help_for_exists():
+    names = {
+        name
+        for page in PAGES
+        for name in re.findall(r'help\("([\w.]+)"\)', page.read_text("utf-8"))
+    }
+    assert names
+    for name in names:
+        assert importlib.import_module(name).__doc__, name
+
+
 def test_the_page_of_examples_lists_every_example():
     page = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"`examples/(\w+\.py)`", page))

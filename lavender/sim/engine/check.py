@@ -188,7 +188,7 @@ def _check_kept_contacts(new: State, pair: np.ndarray) -> None:
     is_finite = np.isfinite(b["impulse"][rows[0] : sum(rows)]).all()
     require_intact(is_finite, "impulse is not finite")
     is_path = np.isfinite(b["moved"]).all() and (b["moved"] >= 0.0).all()
-    require_intact(is_path, "moved is no length")
+    require_intact(is_path, "moved has a value that is negative or not finite")
 
 
 def require_intact(is_valid: Any, reason: str) -> None:
