@@ -34,7 +34,12 @@ SOLVERS = {
 TOLERANCES = [10.0**-k for k in range(1, 10)]
 MODEL = "humanoidstandup.xml"
 #: Printed by `lavender tune` for this model, with MuJoCo 4.0.0.
-TUNED = {"solver": mujoco.mjtSolver.mjSOL_NEWTON, "iterations": 100, "tolerance": 1e-15}
+TUNED = {
+    "solver": mujoco.mjtSolver.mjSOL_NEWTON,
+    "iterations": 100,
+    "tolerance": 1e-15,
+    "ls_tolerance": 0.001,
+}
 MAX_SECONDS = 2.0  # CPU time after which no smaller tolerance is tried
 WORLDS, STEPS = 64, 200
 
