@@ -34,7 +34,7 @@ from lavender.io.mujoco_step import step_from_mujoco
 from lavender.io.step_record import ConstraintBlock, StepRecord, get_force
 from lavender.problem import Problem
 from lavender.problem.data import check_problem
-from lavender.report.text import NONE, format_size, format_sizes
+from lavender.report.text import NONE, format_sizes, format_speed
 
 #: Part of a comparison -> cause in words, in the order of tables.
 CAUSES = {
@@ -220,29 +220,30 @@ class SlipExplanation:
         slip = self.slips.iloc[i]
         unit = self.units[i] if self.units else "m/s"
         if slip["cause"] == "no slip":
-            return [f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} {unit}."]
-        lines = [f"Fastest: {slip['contact']} with {format_size(slip['speed'])} {unit}."]
+            return [
+                f"No chosen contact slides faster than {format_speed(MIN_EXPLAINED_SLIP, unit)}."
+            ]
+        lines = [f"Fastest: {slip['contact']} with {format_speed(slip['speed'], unit)}."]
         if slip["cause"] == UNKNOWN_SURFACE:
             lines.append(
                 "Its friction force is far below its limit, so that it does not slide at this limit: the speed of its "
                 "surface is not known. Give surface_velocity, if the surface moves."
             )
         else:
-            lines.append(f"Largest part: {self._describe_part(slip['cause'], i)} {unit}.")
+            lines.append(f"Largest part: {self._describe_part(slip['cause'], i, unit)}.")
         ranked = sorted(self.parts, key=lambda cause: -self.parts[cause][i])
         _, high = self.intervals[ranked[1]][i]
         low, _ = self.intervals[ranked[0]][i]
         if high > low and high > MIN_EXPLAINED_SLIP:
-            lines.append(
-                f"The order of exchange decides; also: {self._describe_part(ranked[1], i)} {unit}."
-            )
+            part = self._describe_part(ranked[1], i, unit)
+            lines.append(f"The order of exchange decides; also: {part}.")
         use = None if self.friction_use is None else float(self.friction_use[i])
         is_joint = not slip["contact"].startswith("contact")
         has_force = is_joint or use is None or not np.isnan(use)
         if self.speeds_before is not None:
             before = float(self.speeds_before[i])
             after = float(self.rigid_speeds[i])
-            lines.append(f"Before the step it slid with {format_size(before)} {unit}.")
+            lines.append(f"Before the step it slid with {format_speed(before, unit)}.")
             if slip["cause"] == CAUSES["rigid"] and before >= MIN_EARLIER_FRACTION * after:
                 slows = "slows it" if after < before else "does not slow it"
                 lines.append(f"The cause is that it slid already; friction {slows}.")
@@ -258,15 +259,13 @@ class SlipExplanation:
             lines.append(f"In the engine's answer its friction force is {share}.")
         return lines
 
-    def _describe_part(self, cause: str, i: int) -> str:
+    def _describe_part(self, cause: str, i: int, unit: str) -> str:
         """Return the part of a cause with its interval."""
         mean, (low, high) = self.parts[cause][i], self.intervals[cause][i]
-        text = f"{cause}, {format_size(mean)}"
-        return (
-            f"{text} ({format_size(low)} to {format_size(high)})"
-            if high - low > 0.05 * abs(mean)
-            else text
-        )
+        text = f"{cause}, {format_speed(mean, unit)}"
+        if high - low <= 0.05 * abs(mean):
+            return text
+        return f"{text} ({format_speed(low, unit)} to {format_speed(high, unit)})"
 
     @property
     def advice(self) -> list[str]:
@@ -283,8 +282,8 @@ class SlipExplanation:
         before = get_slip(now)
         time = f"in the next {REMEDY_STEPS} steps" if is_later else "in the same step"
         if not before > MIN_EXPLAINED_SLIP:
-            mean = f"{format_size(before)} m/s as it is"
-            limit = f"{MIN_EXPLAINED_SLIP:g} m/s"
+            mean = f"{format_speed(before)} as it is"
+            limit = format_speed(MIN_EXPLAINED_SLIP)
             return [
                 f"No setting is needed: the mean slip {time} is {mean}; up to {limit} count as no slip."
             ]
@@ -293,7 +292,7 @@ class SlipExplanation:
         if not helpful:
             return [f"None of these settings reduces the slip {time} by more than 10 %."]
         pair = f" of {self.followed}" if self.followed else ""
-        head = f"Settings that help (mean slip{pair} {time}, {format_size(before)} m/s as it is):"
+        head = f"Settings that help (mean slip{pair} {time}, {format_speed(before)} as it is):"
         helpful.sort(key=get_slip)
         lost = {
             r.setting: f"; {r.kept} of {self.n_states} states keep contact, and {now.kept} as it is"
@@ -301,8 +300,7 @@ class SlipExplanation:
             if r.kept < now.kept
         }
         lines = [
-            f"  {r.setting}: {format_size(get_slip(r))} m/s{lost.get(r.setting, '')}"
-            for r in helpful
+            f"  {r.setting}: {format_speed(get_slip(r))}{lost.get(r.setting, '')}" for r in helpful
         ]
         return [head, *lines]
 

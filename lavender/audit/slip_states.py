@@ -108,8 +108,13 @@ class SlipOfStates:
 
     @property
     def sentences(self) -> list[str]:
-        """Sentences on the fastest point, with its state, and whether its cause is that of its pair's mean."""
+        """Sentences on the fastest point, with its state, and whether its cause is that of its pair's mean.
+
+        Empty if no contact slips, which the verdict says.
+        """
         fastest = self.fastest
+        if self.slips.iloc[0]["cause"] == "no slip":
+            return []
         lines = fastest.sentences
         if len(self.explanations) > 1:
             lines = [f"State {fastest.state} (counted from 0) has the fastest point.", *lines]
@@ -206,7 +211,7 @@ class SlipOfStates:
         source = f"lavender slip · {model} · {format_count(n, 'state')} with contact"
         head, *settings = worst.advice or [""]
         advice = f"{head} {'; '.join(map(str.strip, settings))}." if settings else head
-        sentences = [" ".join(self.sentences), *filter(None, [advice])]
+        sentences = [*filter(None, [" ".join(self.sentences), advice])]
         footer = [
             *filter(None, [self.left_out]),
             "Files: forces.csv (contacts of all states), numbers.json, figures/ (PDF, SVG, PNG).",

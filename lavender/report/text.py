@@ -79,13 +79,13 @@ def format_speed(v: float, unit: str = "m/s", limit: float = math.nan) -> str:
     if not math.isfinite(v):
         return NONE
     for scale, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ")):
-        if v >= 0.0995 * scale:
+        if abs(v) >= 0.0995 * scale:
             x = v / scale
             y = limit / scale
             digits = 2
             while x != y and digits < 15 and f"{x:.{digits}g}" == f"{y:.{digits}g}":
                 digits += 1
-            text = f"{x:.0f}" if x >= 9.95 and digits == 2 else f"{x:.{digits}g}"
+            text = f"{x:.0f}" if abs(x) >= 9.95 and digits == 2 else f"{x:.{digits}g}"
             units = " or ".join(f"{prefix}{one}" for one in unit.split(" or "))
             return f"{text}\u00a0{units}"
     return f"{v:.0e}\u00a0{unit}".replace("e-0", "e-").replace("0e+00", "0")

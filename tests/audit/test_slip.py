@@ -523,3 +523,13 @@ def test_stop_that_returns_more_than_the_approach_is_softness():
     assert explanation.contacts == ("upper limit of stop",) and explanation.causes == ("softness",)
     assert not any("normal force" in line for line in explanation.sentences)
     assert 'solreflimit="0.002 1"' in str(explanation.comparison)
+
+
+def test_a_model_without_slip_has_one_sentence():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .0999"><freejoint/>'
+        '<geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>'
+    )
+    result = explain_slip_of_states(model, steps=20)
+    assert result.verdict.startswith("No contact slips") and result.sentences == []
+    assert result.make_page(None).sentences == []
