@@ -43,8 +43,8 @@ class Backend:
     behaviour: Any = None
     # Function that calls the backend's own interface. Default: the backend is called through qpsolvers.
     call: Call | None = None
-    # Options to pass through qpsolvers: name -> a field of `Limits` (a str), or a fixed value. None if the backend runs
-    # at its own tolerance, or has a function `call`.
+    # Options to pass through qpsolvers: name -> a field of `Limits` (a str), a fixed value, or a list with a value for
+    # each of the two calls. None if the backend runs at its own tolerance, or has a function `call`.
     settings: Mapping[str, Any] | None = None
     min_tolerance: float = 0.0  # Smallest tolerance that the backend accepts.
     max_iter: int = 10_000  # Default limit of the iterations of a call.
@@ -101,7 +101,8 @@ def _call_through_qpsolvers(
 
     limits = {**vars(limit), "eps": max(limit.eps, backend.min_tolerance)}
     options = {
-        name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()
+        name: limits[x] if isinstance(x, str) else x[limit.attempt] if isinstance(x, list) else x
+        for name, x in (backend.settings or {}).items()
     }
     settings = {
         name: x for name, x in options.items() if x is not None

@@ -45,6 +45,7 @@ class Limits:
     gap: float  # Gap of the primal and dual objectives, absolute and relative.
     max_iter: int
     time_limit: float | None  # [s]
+    attempt: int = 0  # 0 in the first call, 1 in the second.
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def call_backend_until_accepted(
             )
         elif interior:
             left = min(left, work.get("iterations", left) + MORE_INTERIOR_ITERATIONS)
-        limits = Limits(eps, gap, left, deadline.get_remaining_seconds(1e-6))
+        limits = Limits(eps, gap, left, deadline.get_remaining_seconds(1e-6), attempt)
         begin = None if start is None else program.scale_point(*start)
         answer = _call_backend_once(scaled, begin, call, limits, dict(settings))
         work = sum_work_counts((work, {"backend_calls": 1}, answer.work))
