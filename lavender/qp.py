@@ -31,6 +31,7 @@ from lavender.base.errors import (
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem as ConstraintProblem
+from lavender.problem.program import make_quadratic_program
 from lavender.programs import quadratic
 from lavender.programs.backends import BACKENDS
 from lavender.solvers.registry import available
@@ -379,10 +380,12 @@ def _solve(
 ) -> tuple[Any, float, float]:
     """Return the answer of `lavender.solve_qp`, and the times [s] to build the program and to solve it."""
     begun = perf_counter()
-    problem = arrays[0]
-    if not isinstance(problem, ConstraintProblem):
-        with _translate({InputError: "ProblemError"}):
-            problem = ConstraintProblem.from_qp(*arrays)
+    problem = arrays[0] if isinstance(arrays[0], ConstraintProblem) else None
+    with _translate({InputError: "ProblemError"}):
+        if problem is None:
+            program = make_quadratic_program(arrays)
+        else:
+            program = quadratic.get_quadratic_program(problem)
     built = perf_counter()
     kinds: dict[type[Exception], str] = {
         UnknownName: "SolverNotFound",
@@ -391,8 +394,10 @@ def _solve(
         InputError: "ParamError",
     }
     with _translate(kinds):
-        answer = quadratic.solve_qp(
+        answer = quadratic.solve_program(
+            program,
             problem,
+            built,
             solver=solver,
             initvals=initvals,
             verbose=verbose,

@@ -173,15 +173,18 @@ class Generalized:
         }
         return make_instance(Generalized, attributes)
 
-    def with_diagonal_shift(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
-        """Return a copy with M + diag(d), d (nv,), in the same order of elimination.
+    def with_diagonal_shift(
+        self, d: FloatArray | None, momentum: FloatArray | None = None
+    ) -> Generalized:
+        """Return a copy with M + diag(d), d (nv,) or None for 0, in the same order of elimination.
 
         With `momentum` (nv,) [kg m/s], v* is the solution of (M + diag(d)) v* = momentum.
         """
         indptr, indices, data = self.operator.mass
-        data = data.copy()
-        data[indptr[1:] - 1] += d if self.order is None else d[self.order]
-        as_array("M", data, ANY_LENGTH, copy=False)
+        if d is not None:
+            data = data.copy()
+            data[indptr[1:] - 1] += d if self.order is None else d[self.order]
+            as_array("M", data, ANY_LENGTH, copy=False)
         new = object.__new__(Generalized)
         operator = kernels.Operator(*self.operator.jac, indptr, indices, data, self.operator)
         new.__dict__.update(names=self.names, order=self.order, operator=operator)

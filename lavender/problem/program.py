@@ -81,6 +81,7 @@ MAX_PROGRAM_ASYMMETRY = (
 )
 # Up to this many variables, the message about an indefinite P has its smallest eigenvalue.
 MAX_EIGENVALUE_SIZE = 1000
+NO_ROWS: IntpArray = np.zeros(0, np.intp)
 ProgramArrays = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
 
@@ -385,7 +386,9 @@ class QuadraticProgram:
         """
         ptr, _, value = self.jacobian
         target = self.target
-        if not (np.diff(ptr).all() and value.all()):
+        if (ptr[1:] > ptr[:-1]).all() and value.all():
+            self.__dict__["violated_empty_rows"] = NO_ROWS
+        else:
             is_general = self.variable < 0
             is_empty = self._is_empty_row
             largest = np.abs(target).max(initial=0.0, where=is_general & ~is_empty)
@@ -605,7 +608,7 @@ def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[
     """Return J and M = P of (4), and whether P is singular and not factored; raise InputError for an indefinite P."""
     momentum = -q
     unfactored = Generalized.from_validated(jac, lower)
-    definite = _factor_shifted(unfactored, np.zeros(len(q)), momentum)
+    definite = _factor_shifted(unfactored, None, momentum)
     if definite is not None and definite.operator.least_pivot > MAX_SINGULAR_PIVOT:
         return definite, False
     diagonal = lower[2][lower[0][1:] - 1]
@@ -621,9 +624,9 @@ def _factor_hessian(lower: Compressed, jac: Compressed, q: FloatArray) -> tuple[
 
 
 def _factor_shifted(
-    unfactored: Generalized, d: FloatArray, momentum: FloatArray
+    unfactored: Generalized, d: FloatArray | None, momentum: FloatArray
 ) -> Generalized | None:
-    """Return J and P + diag(d), or None if that is not positive definite."""
+    """Return J and P + diag(d), or J and P without d; None if that is not positive definite."""
     try:
         return unfactored.with_diagonal_shift(d, momentum)
     except InputError:

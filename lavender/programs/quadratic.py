@@ -37,7 +37,7 @@ from lavender.judge.solution import (
     sum_work_counts,
 )
 from lavender.problem import Problem, QPSolution
-from lavender.problem.program import make_quadratic_program
+from lavender.problem.program import QuadraticProgram, make_quadratic_program
 from lavender.programs.judges import is_false_claim
 from lavender.programs.qp_solver import OPTION_HELP
 from lavender.programs.task import MIN_TOL, ProgramTask, Run
@@ -130,11 +130,7 @@ def solve_qp(
             solver = q
             q = None
         problem = P
-        qp = P.qp
-        if qp is None:
-            raise InputError(
-                "the problem contains no quadratic program; one of Problem.from_qp is needed"
-            )
+        qp = get_quadratic_program(P)
         if any(x is not None for x in (G, A, lb, ub)):
             raise InputError(
                 "G, A, lb or ub is given with a problem; only q, h and b of it can be replaced"
@@ -150,6 +146,46 @@ def solve_qp(
                 )
             P = sp.csr_array((np.size(q), np.size(q)))
         qp = make_quadratic_program((P, q, G, h, A, b, lb, ub))
+    return solve_program(
+        qp,
+        problem,
+        begun,
+        solver=solver,
+        initvals=initvals,
+        verbose=verbose,
+        tol=tol,
+        time_limit=time_limit,
+        max_iter=max_iter,
+        impulse=impulse,
+        **options,
+    )
+
+
+def get_quadratic_program(problem: Problem) -> QuadraticProgram:
+    """Return the program of a problem of `Problem.from_qp`."""
+    qp: QuadraticProgram | None = problem.qp
+    if qp is None:
+        raise InputError(
+            "the problem contains no quadratic program; one of Problem.from_qp is needed"
+        )
+    return qp
+
+
+def solve_program(
+    qp: QuadraticProgram,
+    problem: Problem | None,
+    begun: float,
+    *,
+    solver: str = "auto",
+    initvals: Any = None,
+    verbose: bool = False,
+    tol: float = 1e-9,
+    time_limit: float | None = None,
+    max_iter: int | None = None,
+    impulse: Any = None,
+    **options: Any,
+) -> QPSolution:
+    """Solve a program as `solve_qp` does; `problem` is its constraint problem, if there is one already."""
     tol = check_float("tol", tol, low=0.0)
     limit = check_time_limit(time_limit)
     deadline = Deadline(None if limit == math.inf else limit)

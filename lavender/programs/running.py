@@ -252,11 +252,12 @@ class _SharedContext:
                 self._context.__exit__(None, None, None)
 
 
-@contextlib.contextmanager
-def _ignore_warnings() -> Iterator[None]:
-    with warnings.catch_warnings():
+class _IgnoredWarnings(warnings.catch_warnings):
+    """A context in which warnings are ignored."""
+
+    def __enter__(self) -> None:
+        super().__enter__()
         warnings.simplefilter("ignore")
-        yield
 
 
 @contextlib.contextmanager
@@ -279,13 +280,17 @@ def _discard_output() -> Iterator[None]:
 
 
 _without_warnings, _without_output = (
-    _SharedContext(_ignore_warnings),
+    _SharedContext(_IgnoredWarnings),
     _SharedContext(_discard_output),
 )
 
 
 @contextlib.contextmanager
-def quiet(noisy: bool) -> Iterator[None]:
-    """Ignore the warnings of a backend and, if it is `noisy`, discard all output of the process while it runs."""
-    with _without_warnings, _without_output if noisy else contextlib.nullcontext():
+def _silence() -> Iterator[None]:
+    with _without_warnings, _without_output:
         yield
+
+
+def quiet(noisy: bool) -> contextlib.AbstractContextManager[None]:
+    """Ignore the warnings of a backend and, if it is `noisy`, discard all output of the process while it runs."""
+    return _silence() if noisy else _without_warnings
