@@ -13,7 +13,6 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 NAMES = (
     "backends",
     "corpus",
-    "decisions",
     "engine_claims",
     "kernels",
     "limits",

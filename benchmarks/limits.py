@@ -12,6 +12,7 @@ The sheet `programs` prints for each solver in which share of quadratic programs
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from time import thread_time
@@ -20,6 +21,7 @@ from typing import Any
 import click
 import numpy as np
 import scipy.sparse as sp
+from scipy.stats import gmean
 
 import lavender as lv
 import lavender.solving.loop
@@ -187,17 +189,15 @@ def measure_auto(problem: Problem, rng: np.random.Generator) -> list[Line]:
     (own, over) = np.median(runs, axis=0)[0]
     others = np.median(runs, axis=0)[1:, 0]
     at_start = lv.residual(problem, problem.start() if start is None else start).relative
-    ratio = max(own, TOLERANCE) / max(others.min(), TOLERANCE)
-    best = names[1 + int(others.argmin())]
     line = {
         "name": problem.name,
         "rows": problem.m,
         "limit": limit,
         "residual": own,
         "best": others.min(),
-        "by": best,
+        "by": names[1 + int(others.argmin())],
         "at start": at_start,
-        "ratio": ratio,
+        "ratio": max(own, TOLERANCE) / max(others.min(), TOLERANCE),
         "time": over,
     }
     return [line]
@@ -206,49 +206,32 @@ def measure_auto(problem: Problem, rng: np.random.Generator) -> list[Line]:
 def print_auto(lines: list[Line], worst: int) -> None:
     """Print the figures of the sheet `auto`, and the lines with the largest ratios."""
     ratio, time = (np.array([line[key] for line in lines]) for key in ("ratio", "time"))
-    click.echo(
-        markdown(
-            ["figure", "value"],
-            [
-                [
-                    "residual of `auto` over that of the best sweeps, geometric mean",
-                    f"{np.exp(np.log(ratio).mean()):.2f}",
-                ],
-                [
-                    "the same, of ratios above 1",
-                    f"{np.exp(np.log(np.maximum(ratio, 1.0)).mean()):.2f}",
-                ],
-                ["above 10 times", str(int((ratio > 10.0).sum()))],
-                [
-                    "worse than the start",
-                    str(sum(line["residual"] > line["at start"] * (1 + 1e-9) for line in lines)),
-                ],
-                [
-                    "time over the limit, median, 95 %, worst",
-                    ", ".join(f"{x:.2f}" for x in np.quantile(time, (0.5, 0.95, 1))),
-                ],
-            ],
-        )
-    )
-    head = ["problem", "rows", "limit [ms]", "`auto`", "best sweeps", "start", "time/limit"]
-    click.echo(
-        "\n"
-        + markdown(
-            head,
-            [
-                [
-                    x["name"],
-                    x["rows"],
-                    f"{1e3 * x['limit']:.2f}",
-                    f"{x['residual']:.1e}",
-                    f"{x['best']:.1e} {x['by']}",
-                    f"{x['at start']:.1e}",
-                    f"{x['time']:.2f}",
-                ]
-                for x in sorted(lines, key=lambda x: -x["ratio"])[:worst]
-            ],
-        )
-    )
+    lost = sum(line["residual"] > line["at start"] * (1 + 1e-9) for line in lines)
+    quantiles = ", ".join(f"{x:.2f}" for x in np.quantile(time, (0.5, 0.95, 1)))
+    figures = {
+        "residual of `auto` over that of the best sweeps, geometric mean": f"{gmean(ratio):.2f}",
+        "the same, of ratios above 1": f"{gmean(np.maximum(ratio, 1.0)):.2f}",
+        "above 10 times": (ratio > 10.0).sum(),
+        "worse than the start": lost,
+        "time over the limit, median, 95 %, worst": quantiles,
+    }
+    columns = {
+        "limit [ms]": lambda x: f"{1e3 * x['limit']:.2f}",
+        "`auto`": lambda x: f"{x['residual']:.1e}",
+        "best sweeps": lambda x: f"{x['best']:.1e} {x['by']}",
+        "start": lambda x: f"{x['at start']:.1e}",
+        "time/limit": lambda x: f"{x['time']:.2f}",
+    }
+    print_figures(figures, columns, sorted(lines, key=lambda x: -x["ratio"])[:worst])
+
+
+def print_figures(
+    figures: dict[str, Any], columns: dict[str, Callable[[Line], str]], lines: list[Line]
+) -> None:
+    """Print a table of figures, and one of lines with these columns."""
+    click.echo(markdown(["figure", "value"], figures.items()))
+    rows = ((x["name"], x["rows"], *(cell(x) for cell in columns.values())) for x in lines)
+    click.echo("\n" + markdown(["problem", "rows", *columns], rows))
 
 
 def measure_prepared(problem: Problem, rng: np.random.Generator) -> list[Line]:
@@ -280,35 +263,19 @@ def measure_prepared(problem: Problem, rng: np.random.Generator) -> list[Line]:
 def print_prepared(lines: list[Line], worst: int) -> None:
     """Print the figures of the sheet `prepared`, and the lines with the largest times over 2 L."""
     excess = np.array([line["excess"] for line in lines])
-    click.echo(
-        markdown(
-            ["figure", "value"],
-            [
-                ["solves", str(len(lines))],
-                ["CPU time at most 2 L + 5 ms", f"{np.mean(excess <= 5e-3):.2%}"],
-                ["CPU time at most 2 L + 25 ms", f"{np.mean(excess <= 25e-3):.2%}"],
-                ["largest time over 2 L", f"{1e3 * excess.max():.1f} ms"],
-            ],
-        )
-    )
-    head = ["problem", "rows", "solver", "limit [ms]", "time [ms]", "status"]
-    click.echo(
-        "\n"
-        + markdown(
-            head,
-            [
-                [
-                    x["name"],
-                    x["rows"],
-                    x["solver"],
-                    f"{1e3 * x['limit']:.1f}",
-                    f"{1e3 * x['time']:.1f}",
-                    x["status"],
-                ]
-                for x in sorted(lines, key=lambda x: -x["excess"])[:worst]
-            ],
-        )
-    )
+    figures = {
+        "solves": len(lines),
+        "CPU time at most 2 L + 5 ms": f"{np.mean(excess <= 5e-3):.2%}",
+        "CPU time at most 2 L + 25 ms": f"{np.mean(excess <= 25e-3):.2%}",
+        "largest time over 2 L": f"{1e3 * excess.max():.1f} ms",
+    }
+    columns = {
+        "solver": lambda x: x["solver"],
+        "limit [ms]": lambda x: f"{1e3 * x['limit']:.1f}",
+        "time [ms]": lambda x: f"{1e3 * x['time']:.1f}",
+        "status": lambda x: x["status"],
+    }
+    print_figures(figures, columns, sorted(lines, key=lambda x: -x["excess"])[:worst])
 
 
 def print_sheet(sheet: str, count: int, seed: int, worst: int = 12) -> None:

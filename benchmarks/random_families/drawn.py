@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,8 +26,9 @@ from benchmarks.random_families.wild import (
     Structure,
     World,
     between,
+    bodies_of,
     given_as,
-    masses_of,
+    make_draft,
     on_floor,
     problem_of,
     tenfold,
@@ -37,7 +37,7 @@ from lavender.base.errors import check_name
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
-from lavender.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
+from lavender.suite.build import Contacts, map_scalar
 from lavender.suite.case import Draft
 from lavender.suite.families import BOX, SPHERE, check_min_sizes
 
@@ -369,15 +369,10 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     wanted = 8.0 * (rows / 8.0) ** rng.random()
     if name in MATRICES:
         problem = MATRICES[name](rng, max(4, round(wanted)))
-        problem = replace(problem, name=title, copy=False)
-        return Draft(
-            problem, f"{name}, {problem.law}, given as {problem.operator}: drawn, not chosen"
-        )
+        return make_draft(problem, title, f"{name}, {problem.law}", problem.operator)
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
     world = WORLDS[name](rng, max(2, round(wanted / (5 if rolls else 1 if law == "none" else 3))))
-    bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
-    bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
-    add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
+    bodies = bodies_of(rng, world, masses, seed)
     soft = 10.0 ** rng.uniform(-4.0, 1.0) if name == "jelly" else None
     if rolls:
         law = str(rng.choice(LAWS[1:3]))
@@ -393,7 +388,4 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
         problem = Problem.from_rows(made, mu=rng.uniform(0.2, 0.9), **more)
     else:
         problem, form = given_as(rng, problem_of(rng, world, bodies, law, soft), form)
-    problem = replace(problem, name=title, copy=False)
-    return Draft(
-        problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen"
-    )
+    return make_draft(problem, title, f"{name}, masses {masses}, friction {law}", form)

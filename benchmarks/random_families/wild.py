@@ -242,14 +242,24 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
     wanted = 8.0 * (rows / 8.0) ** rng.random()
     world = STRUCTURES[name](rng, max(2, round(wanted / (1 if law == "none" else 3))))
+    bodies = bodies_of(rng, world, masses, seed)
+    problem, form = given_as(rng, problem_of(rng, world, bodies, law), form)
+    title = f"wild(seed={seed}, rows={rows})"
+    return make_draft(problem, title, f"{name}, masses {masses}, friction {law}", form)
+
+
+def bodies_of(rng: np.random.Generator, world: World, masses: str, seed: int) -> Bodies:
+    """Draw the masses and velocities of a world's bodies."""
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
     add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
-    problem, form = given_as(rng, problem_of(rng, world, bodies, law), form)
-    problem = replace(problem, name=f"wild(seed={seed}, rows={rows})", copy=False)
-    return Draft(
-        problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen"
-    )
+    return bodies
+
+
+def make_draft(problem: Problem, title: str, what: str, form: str) -> Draft:
+    """Name a drawn problem and describe it."""
+    problem = replace(problem, name=title, copy=False)
+    return Draft(problem, f"{what}, given as {form}: drawn, not chosen")
 
 
 def given_as(rng: np.random.Generator, problem: Problem, form: str) -> tuple[Problem, str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_int, format_html_table, mark_read_only
-from lavender.base.deadline import NEVER, Deadline
+from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, LavenderError, require_packages
 from lavender.batch.data import Batch
 from lavender.batch.residuals import (
@@ -29,7 +29,7 @@ from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.compiled_call import compute_postponed_fields
-from lavender.solving.limits import check_time_limit
+from lavender.solving.limits import start_limit
 from lavender.solving.loop import MIN_TIME_LIMIT
 from lavender.solving.prepared import SOLVE_ARGUMENTS, Prepared, check_arguments, check_options
 from lavender.solving.solve import solve
@@ -367,11 +367,10 @@ def solve_many(
         threads = check_int("threads", threads, 1, None)
     spec = get(solver)
     check_options(spec, options.keys() - SOLVE_ARGUMENTS, MANY_ARGUMENTS)
-    limit = check_time_limit(time_limit)
+    deadline = start_limit(time_limit)
     if velocity_tol is not None:
         velocity_tol = check_velocity_tolerance(velocity_tol, tol)
         tol = _compute_tolerance_for_velocity_error(worlds, velocity_tol)
-    deadline = NEVER if limit == np.inf else Deadline(limit)
     check_arguments(spec, tol, max_iter)
     starts, invalid_starts = _convert_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
@@ -396,11 +395,7 @@ def solve_many(
         problem = worlds[i]
         start = solutions.get_start(i)
         if solutions._worlds.code[i] == CODE["tried"]:
-            own = (
-                Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT))
-                if deadline.is_set
-                else None
-            )
+            own = Deadline(deadline.get_remaining_seconds(MIN_TIME_LIMIT))
             counts = tuple(solutions._worlds.counts[i].tolist())
             prepared = Prepared(problem, spec, named, False)
             checked = check_arguments(spec, tol, max_iter)

@@ -107,14 +107,14 @@ def format_lower_bound(bound: float) -> str:
 
 
 def check_certificate(
-    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
+    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline = NEVER
 ) -> str | None:
     """Return the reason why y (m,) does not prove that no impulse meets `tol`, or None if y proves this."""
     return prove_infeasibility(problem, y, tol, deadline).reason or None
 
 
 def prove_infeasibility(
-    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
+    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline = NEVER
 ) -> Proof:
     """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
@@ -128,7 +128,6 @@ def prove_infeasibility(
     stored: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
     if stored is not None and stored[0] == key:
         return stored[1]
-    deadline = deadline or NEVER
     proof = _prove_with_polished_directions(problem, y, tol, deadline)
     if not (proof.reason and deadline.has_passed()):
         problem.derived.cache[__name__] = key, proof

@@ -22,6 +22,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_sequence
+from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, require_packages
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.judge.solution import CONTRADICTED, Solution, Status, raise_if_interrupted
@@ -33,7 +34,7 @@ from lavender.report.store import ERROR, RUN_COLUMNS, Row
 from lavender.report.text import format_tolerance
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec, program_backends
-from lavender.solving.limits import make_deadline
+from lavender.solving.limits import import_before_limit
 
 DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = (
@@ -97,7 +98,7 @@ def format_call(record: Any, guessed: bool = False) -> tuple[str, ...]:
 def _import_solver_code(solver: str, call: str) -> None:
     """Make a call with one row, with and without a time limit, so that no measurement includes imports."""
     spec = registry.get(solver)
-    make_deadline(spec, 1.0, 0.0)  # Imports the modules that a call with a time limit imports.
+    import_before_limit(spec, Deadline(1.0))
     if not (spec.builtin or spec.requires):
         return
     if call == "solve":

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof, prove_infeasibility
@@ -59,12 +59,12 @@ NEGLIGIBLE_ROW_FRACTION = 1e-6
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
 def prove_relaxation_infeasible(
-    problem: Problem, tol: float, deadline: Deadline | None = None
+    problem: Problem, tol: float, deadline: Deadline = NEVER
 ) -> Proof | None:
     """Return the proof that the convex relaxation has no solution, or None."""
     inner = problem.relaxed("cone")
     spec = get("newton")
-    left = None if deadline is None else deadline.get_remaining_seconds()
+    left = deadline.get_remaining_seconds()
     if spec.refuses(inner) is not None or (left is not None and left <= 0.0):
         return None
     solver = spec.load()()

@@ -1,7 +1,7 @@
 """Numbers on which the decisions of `auto`, the first compiled call and the estimated costs depend.
 
-`python -m benchmarks decisions` counts the work on fixed problems with each number halved and doubled. Costs in
-nanoseconds are measured separately (`rates.json`).
+`python -m benchmarks regret` and `limits` measure the effect of a changed number. Costs in nanoseconds are measured
+separately (`rates.json`).
 """
 
 from __future__ import annotations

@@ -326,7 +326,7 @@ class Newton(Solver):
         ):
             return claim
         try:
-            with limit_forming(deadline) if deadline is not None and deadline.is_set else UNLIMITED:
+            with limit_forming(deadline) if deadline.is_set else UNLIMITED:
                 continuation = self.prepare_continuation(state)
         except TooLate:
             return replace(claim, status=Status.TIME_LIMIT)

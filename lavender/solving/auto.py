@@ -51,18 +51,17 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
-    choose_start,
     combine_best_islands,
     find_relative_at_zero,
     reuse_or_judge_impulse,
 )
-from lavender.judge.solution import Claim, SolverStage, Status, sum_work_counts
+from lavender.judge.solution import Claim, Status, sum_work_counts
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers import certify
 from lavender.solvers.decisions import DECISIONS, SMALL_ROWS, describe_numbers
 from lavender.solvers.islands import get_rows_of_blocks, restrict_to_blocks
 from lavender.solvers.registry import Solver, SolverSpec, get, program_backends
-from lavender.solvers.small import AUTO, describe_stages, describe_work
+from lavender.solvers.small import AUTO, describe_stages
 from lavender.solving.compiled_call import choose_call_deadline, fits_in_time
 from lavender.solving.log import Recorder, SolveLog
 from lavender.solving.loop import EMPTY_CLAIM, Loop
@@ -167,62 +166,62 @@ class Auto(Solver):
             form = solver.prepare(problem)
             claim: Claim = solver.run(form, impulse, max_iter, tol, left, tuple(others))
             return claim
-        counts: tuple[int, ...] | None = state.failed_call
-        first: FirstSweeps | None = None
-        if (
-            deadline.is_set
-            and problem.m > SMALL_ROWS
-            and not problem.cones.has_round
-            and recorder is None
-        ):
-            sweeps = FirstSweeps(problem, deadline)
-            if not sweeps.newton_fits(DECISIONS.ample_time):
-                first = sweeps
-                result_of_sweeps = first.run(impulse, tol, max_iter)
-                if result_of_sweeps is not None:
-                    return add_claim(state.first_claim, result_of_sweeps)
-        may_call = counts is None and max_iter >= DECISIONS.call_iterations
-        if may_call and (first is not None or fits_in_time(problem, deadline)):
-            # The impulse of sweeps is returned if the call does not end.
-            own = deadline if first is not None else choose_call_deadline(problem, deadline)
-            result, counts = AUTO.call.solve(problem, impulse, tol, own)
-            if result is not None and result.relative <= tol:
-                claim = add_claim(
-                    state.first_claim,
-                    AUTO.make_claim(problem, counts, impulse, result.relative),
-                )
-                if claim.iterations <= max_iter:
-                    impulse[:] = result.impulse
-                    return replace(claim, judged=result)
-        failed = AUTO.list_claims_of_failed_call(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
         log = SolveLog(problem, tol, max_iter, deadline, state.first_claim)
-        call_failed = bool(failed) and problem.generalized is not None
-        tree = DecisionTree(
-            problem,
-            deadline,
-            log,
-            state.first_stage,
-            call_failed=call_failed,
-            started_from_zero=call_failed and not (impulse - problem._start).any(),
-            has_swept=first is not None,
-        )
-        log.start_from_better_impulse(impulse)
         log.recorder = recorder
-        if first is not None:
-            log.record_stage(first.name, first.claim, first.before)
+        solved: Claim | None = None
         try:
-            if max_iter > 0 and log.best > tol and not log.done():
-                for name, claim in failed:
-                    log.record_stage(name, claim, log.best)
-                solve(log, tree)
+            solved = run_stages(state, log, impulse)
         except KeyboardInterrupt:
             log.interrupted = True  # Return the best impulse so far also after Ctrl-C.
         except BREAKDOWN as error:
             log.failure = format_error(error)
+        if solved is not None:
+            return solved
         impulse[:] = log.choose_result()
         return log.make_claim()
+
+
+def run_stages(state: AutoState, log: SolveLog, impulse: FloatArray) -> Claim | None:
+    """Run the compiled call and the stages; return the claim of a call that has solved the problem, else None.
+
+    Under a tight time limit sweeps run before the call. It then starts from their result, with all of the time.
+    """
+    problem, tol, deadline = log.problem, log.tol, log.deadline
+    has_swept = sweep_first(log, impulse)
+    if has_swept and log.done():
+        return None
+    start = log.impulse if has_swept else impulse
+    counts: tuple[int, ...] | None = state.failed_call
+    may_call = counts is None and log.budget >= DECISIONS.call_iterations
+    if may_call and (has_swept or fits_in_time(problem, deadline)):
+        own = deadline if has_swept else choose_call_deadline(problem, deadline)
+        result, counts = AUTO.call.solve(problem, start, tol, own)
+        if result is not None and result.relative <= tol:
+            made = AUTO.make_claim(problem, counts, start, result.relative)
+            claim = add_claim(state.first_claim, made)
+            if claim.iterations <= log.budget:
+                impulse[:] = result.impulse
+                return replace(claim, judged=result)
+    failed = AUTO.list_claims_of_failed_call(problem, counts)
+    call_failed = bool(failed) and problem.generalized is not None
+    tree = DecisionTree(
+        problem,
+        deadline,
+        log,
+        state.first_stage,
+        call_failed=call_failed,
+        started_from_zero=call_failed and not (start - problem._start).any(),
+        has_swept=has_swept,
+    )
+    if not has_swept:
+        log.start_from_better_impulse(impulse)
+    if log.budget > 0 and log.best > tol and not log.done():
+        for name, claim in failed:
+            log.record_stage(name, claim, log.best)
+        solve(log, tree)
+    return None
 
 
 def add_claim(first: Claim, claim: Claim) -> Claim:
@@ -239,79 +238,66 @@ def add_claim(first: Claim, claim: Claim) -> Claim:
     )
 
 
-class FirstSweeps:
-    """Sweeps under a tight time limit, before the costs of choosing stages, which may exceed the limit.
+@np.errstate(all="ignore")  # Results that overflow are judged.
+def sweep_first(log: SolveLog, impulse: FloatArray) -> bool:
+    """Sweep from `impulse` before a stage is chosen, if the costs of this may exceed a limit; return whether it was so.
 
-    They have all of the time if no factorisation fits in it, and else their share. They measure the time of counted
-    work on this machine, and continue if a factorisation would then end too late.
+    The sweeps have all of the time if no factorisation fits in it, and else their share. They measure the time of
+    counted work on this machine, and continue if a factorisation would then end too late.
     """
+    problem, deadline, fits = log.problem, log.deadline, log.deadline.fits
+    is_open = log.recorder is None and not problem.cones.has_round
+    if not (deadline.is_set and is_open and problem.m > SMALL_ROWS):
+        return False
+    newton = get("newton").load()()
+    least = newton.estimate_total_cost(problem)  # [ns]
 
-    def __init__(self, problem: Problem, deadline: Deadline) -> None:
-        self.problem, self.deadline = problem, deadline
-        self.newton = get("newton").load()()
-        self.min_newton_cost = self.newton.estimate_total_cost(problem)  # [ns]
-
-    def newton_fits(self, margin: float) -> bool:
+    def newton_fits(margin: float) -> bool:
         """Return whether this multiple of the least cost of Newton's method fits in the remaining time."""
-        fits = self.deadline.fits
-        cost = margin * self.min_newton_cost
-        return fits(cost) and fits(cost + margin * self.newton.estimate_setup_cost(self.problem))
+        return fits(margin * least) and fits(margin * (least + newton.estimate_setup_cost(problem)))
 
-    @np.errstate(all="ignore")  # Results that overflow are judged.
-    def run(self, impulse: FloatArray, tol: float, max_iter: int) -> Claim | None:
-        """Sweep; return the claim of the solve, or None if other solvers continue from the result."""
-        problem = self.problem
-        deadline = self.deadline
-        start = impulse.copy()
-        # Under Coulomb's law `nncg`, except on few bodies.
-        is_small = problem.rows is not None and problem.m <= DECISIONS.island_rows
-        self.name = "anderson" if problem.law != "coulomb" or is_small else "nncg"
-        solver = make_solver(self.name, problem)
-        state = prepare_sweeps(solver, problem, deadline)
-        loop = Loop(problem=problem, solver=solver, state=state, impulse=impulse, tol=tol)
-        # Newton's method may follow: leave its time.
-        share = 1.0
-        left = deadline.get_remaining_nanoseconds()
-        margin = DECISIONS.assumed_pace if problem.law == "coulomb" else DECISIONS.newton_time
-        if self.newton_fits(margin):
-            newton_cost = self.min_newton_cost + self.newton.estimate_setup_cost(problem)
-            rest = 1.0 - margin * newton_cost / left
-            share = min(max(rest, DECISIONS.min_share), DECISIONS.time_share)
-        loop.deadline = deadline if share == 1.0 else Deadline(1e-9 * share * left)
-        # Check the first sweep only if its start is not judged, since the zero impulse may replace the start.
-        at_start = find_relative_at_zero(problem, start)
-        claim = loop.run_chunks(1) if at_start is None else EMPTY_CLAIM
-        self.before = state.watch.best[0] if at_start is None else at_start
-        if claim.status is Status.MAX_ITERATIONS:
-            loop.tol = 0.0
-            claim = loop.run_chunks(min(int(DECISIONS.unchecked_sweeps), max_iter))
-            loop.tol = tol
-        if claim.status is Status.MAX_ITERATIONS:
-            claim = loop.run_chunks(max_iter)
-        if share < 1.0 and claim.status is Status.TIME_LIMIT:
-            counted = loop.done * solver.estimate_iteration_cost(problem)
-            pace = (
-                DECISIONS.pace_margin
-                * (left - deadline.get_remaining_nanoseconds())
-                / max(counted, 1.0)
-            )
-            if not self.newton_fits(max(pace, 1.0)):
-                share = 1.0
-                loop.deadline = deadline
-                claim = loop.run_chunks(max_iter)
-        loop._keep_best(claim)
-        self.claim = claim
-        judged = reuse_or_judge_impulse(problem, impulse, loop.judged)
-        if not judged.relative <= max(tol, self.before):  # Sweeps may raise the error.
-            impulse[:] = choose_start(problem, start, tol)
-            judged = reuse_or_judge_impulse(problem, impulse)
-        is_over = claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT) and share == 1.0
-        if not is_over and claim.status is not Status.CONVERGED:
-            return None
-        status = Status.CONVERGED if judged.relative <= tol else claim.status
-        stages = (SolverStage(self.name, dict(claim.work), self.before, judged.relative),)
-        text = describe_work(self.name, claim.work)
-        return replace(claim, status=status, message=text, form="", stages=stages, judged=judged)
+    if newton_fits(DECISIONS.ample_time):
+        return False
+    # Under Coulomb's law `nncg`, except on few bodies.
+    is_small = problem.rows is not None and problem.m <= DECISIONS.island_rows
+    name = "anderson" if problem.law != "coulomb" or is_small else "nncg"
+    solver = make_solver(name, problem)
+    state = prepare_sweeps(solver, problem, deadline)
+    # Newton's method may follow: leave its time.
+    share = 1.0
+    left = deadline.get_remaining_nanoseconds()
+    margin = DECISIONS.assumed_pace if problem.law == "coulomb" else DECISIONS.newton_time
+    if newton_fits(margin):
+        rest = 1.0 - margin * (least + newton.estimate_setup_cost(problem)) / left
+        share = min(max(rest, DECISIONS.min_share), DECISIONS.time_share)
+    own = deadline if share == 1.0 else Deadline(1e-9 * share * left)
+    loop = Loop(problem, solver, state, impulse.copy(), log.tol, own)
+    # Check the first sweep only if its start is not judged, since the zero impulse may replace the start.
+    at_start = find_relative_at_zero(problem, impulse)
+    claim = loop.run_chunks(1) if at_start is None else EMPTY_CLAIM
+    before = state.watch.best[0] if at_start is None else at_start
+    if claim.status is Status.MAX_ITERATIONS:
+        loop.tol = 0.0
+        claim = loop.run_chunks(min(int(DECISIONS.unchecked_sweeps), log.budget))
+        loop.tol = log.tol
+    if claim.status is Status.MAX_ITERATIONS:
+        claim = loop.run_chunks(log.budget)
+    if share < 1.0 and claim.status is Status.TIME_LIMIT:
+        counted = max(loop.done * solver.estimate_iteration_cost(problem), 1.0)
+        spent = left - deadline.get_remaining_nanoseconds()
+        if not newton_fits(max(DECISIONS.pace_margin * spent / counted, 1.0)):
+            loop.deadline = own = deadline
+            claim = loop.run_chunks(log.budget)
+    loop._keep_best(claim)
+    judged = reuse_or_judge_impulse(problem, loop.impulse, loop.judged)
+    is_over = own is deadline and claim.status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
+    if judged.relative <= (max(log.tol, before) if is_over else log.tol):
+        log.store_last_impulse(judged)
+    else:  # Other solvers continue, or sweeps have raised the error.
+        log.start_from_better_impulse(impulse)
+        log.judge_and_store_best(loop.impulse, judged)
+    log.record_stage(name, claim, before)
+    return True
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.

@@ -46,7 +46,7 @@ def choose_call_deadline(problem: Problem, deadline: Deadline) -> Deadline:
 
 
 def solve_small(
-    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, deadline: Deadline | None = None
+    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, deadline: Deadline
 ) -> tuple[Solution | None, tuple[int, ...] | None]:
     """Solve and judge a small problem by one compiled call, if the solver has one that accepts the problem.
 
@@ -61,18 +61,16 @@ def solve_small(
         Work counts of a call that did not solve the problem. None if the first result is a solution or no call was
         made.
     """
-    if spec.small is None or not (
-        deadline is None or fits_in_time(problem, deadline, spec.delegates)
-    ):
+    if spec.small is None or not fits_in_time(problem, deadline, spec.delegates):
         return None, None
     begin = perf_counter()
-    own = None if deadline is None else choose_call_deadline(problem, deadline)
+    own = choose_call_deadline(problem, deadline)
     solution, judged, counts, start = solve_compiled(problem, spec, impulse, tol, own)
     if solution is not None:
         return solution, None
     if (
         judged is None
-        or deadline is None
+        or not deadline.is_set
         or own is not deadline
         or judged.relative == judged.roundoff_floor
     ):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import check_float
-from lavender.base.deadline import Deadline, read_clock
+from lavender.base.deadline import NEVER, Deadline, stop_clock
 from lavender.base.lazy_import import import_numerical_modules
 from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec
@@ -27,6 +27,11 @@ def check_time_limit(time_limit: Any) -> float:
     return check_float("time_limit", time_limit, above=0.0)
 
 
+def start_limit(time_limit: Any) -> Deadline:
+    """Check the time limit [s] of a call that begins now, and return its deadline; NEVER if it is None."""
+    return NEVER if time_limit is None else Deadline(check_time_limit(time_limit))
+
+
 def reserve_time_of_judge(problem: Problem, deadline: Deadline) -> None:
     """Move the deadline by the counted cost of the passes of the judge after a solve, at most a part of the time."""
     cost = JUDGE_COST + JUDGE_COST_PER_ROW * problem.m + JUDGE_COST_PER_ENTRY * problem.metric.work
@@ -34,16 +39,13 @@ def reserve_time_of_judge(problem: Problem, deadline: Deadline) -> None:
     deadline.extend(-min(1e-9 * cost, MAX_JUDGE_SHARE * left))
 
 
-def make_deadline(spec: SolverSpec, limit: float, begun: float) -> Deadline:
-    """Create the deadline of a call that began at this reading of the clock [s], with a limit [s].
-
-    The solver, and the modules of SciPy that it may need, are imported first, and this time does not count.
-    """
-    begin = read_clock()
-    if spec.external or not spec.builtin:
-        spec.load()
-        import_numerical_modules(*(() if spec.external else spec.requires))
-    else:
-        if spec.lazy_modules:
+def import_before_limit(spec: SolverSpec, deadline: Deadline) -> None:
+    """Import a solver under a limit, and the modules of SciPy that it may need; this time does not count."""
+    if not deadline.is_set:
+        return
+    with stop_clock(deadline):
+        if spec.external or not spec.builtin:
+            spec.load()
+            import_numerical_modules(*(() if spec.external else spec.requires))
+        elif spec.lazy_modules:
             import_numerical_modules(*spec.lazy_modules)
-    return Deadline(limit, begun + read_clock() - begin)

@@ -101,7 +101,11 @@ class SolveLog:
     @property
     def result(self) -> FloatArray:
         """Impulse (m,) [N s] with the best impulse of each island, until one impulse meets tol in all islands."""
-        return self.problem._start if self._best_islands is None else self._best_islands.impulse
+        return self.impulse if self._best_islands is None else self._best_islands.impulse
+
+    def store_last_impulse(self, judged: Any) -> None:
+        """Store an impulse after which no other solver runs, with the judge's result, and not island by island."""
+        self.best, self.impulse, self.judged = float(judged.relative), judged.impulse, judged
 
     def choose_result(self) -> FloatArray:
         """Return the impulse (m,) [N s] of the solve: one that meets tol, or the best one of each island.

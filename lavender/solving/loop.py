@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import CHUNK_TIME, LIMITED_CHUNK_TIME, Deadline
+from lavender.base.deadline import CHUNK_TIME, LIMITED_CHUNK_TIME, NEVER, Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import (
     Residual,
@@ -69,7 +69,7 @@ class Loop:
     state: Any  # State of the solver.
     impulse: FloatArray  # Start (m,) [N s]; replaced by the result in place.
     tol: float
-    deadline: Deadline | None = None
+    deadline: Deadline = NEVER
     callback: Callback | None = None
     records: list[Record] | None = None  # The history; None if it is not requested.
     # Solver of each record, if `auto` makes the records.
@@ -85,14 +85,11 @@ class Loop:
     def run_in_one_call(self, max_iter: int) -> Claim:
         """Run a solver that cannot be continued, in one call."""
         start_point = self.impulse.copy()
-        deadline = self.deadline
         begin = perf_counter()
         try:
             try:
-                claim = self.call_solver(
-                    max_iter,
-                    None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT),
-                )
+                left = self.deadline.get_remaining_seconds(MIN_TIME_LIMIT)
+                claim = self.call_solver(max_iter, left)
             finally:
                 self.time = perf_counter() - begin - self.recording_time
             self.done = claim.iterations
@@ -125,18 +122,16 @@ class Loop:
         """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
         # Assume 1 ns per unit of work for the first chunk, with a limit for solvers in Python; later chunks are
         # measured.
-        seconds, first = CHUNK_TIME, FIRST_CHUNK_ITERATIONS
-        if self.deadline is not None:
-            seconds = self._choose_chunk_time()
-            first = FIRST_LIMITED_ITERATIONS
-        chunk = min(first, max(1, int(1e9 * seconds) // max(1, self.problem.metric.work)))
-        if self.deadline is not None and self.done == 0:
+        deadline = self.deadline
+        nanoseconds = int(1e9 * self._choose_chunk_time())
+        first = FIRST_LIMITED_ITERATIONS if deadline.is_set else FIRST_CHUNK_ITERATIONS
+        chunk = min(first, max(1, nanoseconds // max(1, self.problem.metric.work)))
+        if deadline.is_set and self.done == 0:
             chunk = max(1, chunk // LIMITED_CHUNK_MARGIN)
         records = self.records is not None or self.callback is not None
         claim = EMPTY_CLAIM
-        deadline = self.deadline
         try:
-            if deadline is not None:
+            if deadline.is_set:
                 begin = perf_counter()
                 self.solver.set_deadline(self.state, deadline)
                 self.time += perf_counter() - begin
@@ -161,7 +156,7 @@ class Loop:
                 if stopped:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
-                if deadline is not None and deadline.has_passed():
+                if deadline.has_passed():
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
                 if self.done < max_iter:
@@ -178,7 +173,7 @@ class Loop:
 
     def _choose_chunk_time(self) -> float:
         """Return the intended time of the next chunk [s]."""
-        left = None if self.deadline is None else self.deadline.get_remaining_seconds()
+        left = self.deadline.get_remaining_seconds()
         return CHUNK_TIME if left is None else min(LIMITED_CHUNK_TIME, left)
 
     def _is_long(self, claim: Claim) -> bool:

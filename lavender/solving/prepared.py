@@ -33,7 +33,6 @@ from lavender.base.deadline import (
     Deadline,
     TooLate,
     limit_forming,
-    read_clock,
     stop_clock,
 )
 from lavender.base.errors import (
@@ -71,7 +70,7 @@ from lavender.solvers.islands import find_islands
 from lavender.solvers.registry import Solver, SolverSpec, get
 from lavender.solving.compiled_call import solve_small
 from lavender.solving.finish import FinishedRun, decide_empty_rows, finish, name_lost_row
-from lavender.solving.limits import check_time_limit, make_deadline, reserve_time_of_judge
+from lavender.solving.limits import import_before_limit, reserve_time_of_judge, start_limit
 from lavender.solving.loop import MIN_TIME_LIMIT, Callback, Loop, get_stopping_test
 from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import residuals_by_island
@@ -191,7 +190,7 @@ class Prepared:
         self.setup_time = 0.0  # [s] Time of the preparation since the last solve.
         # `auto` has nothing to prepare before its compiled call for small problems.
         if begin and (options or not spec.delegates):
-            self._set_up(problem, None)
+            self._set_up(problem)
         self.setup_time = perf_counter() - start
 
     def __repr__(self) -> str:
@@ -253,8 +252,7 @@ class Prepared:
         """
         for name in unknown:
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS)
-        begun = 0.0 if time_limit is None else read_clock()
-        limit = math.inf if time_limit is None else check_time_limit(time_limit)
+        deadline = start_limit(time_limit)
         original = self.problem if problem is None else problem
         if b is not None or v_free is not None:
             original = self._update_problem(problem, b, v_free)
@@ -271,8 +269,7 @@ class Prepared:
             failed_call: tuple[int, ...] | None = None
             is_default = max_iter is None and callback is None and history is False
             if is_default and self.spec.delegates and not self.options:
-                own = None if limit == math.inf else Deadline(limit, begun)
-                solution, failed_call = solve_small(original, self.spec, impulse, tol, own)
+                solution, failed_call = solve_small(original, self.spec, impulse, tol, deadline)
             if solution is not None:
                 if original is not self.problem:
                     if not original.has_operator_of(self.problem):
@@ -280,7 +277,7 @@ class Prepared:
                     self.problem = original
                     self._setup = SetUp()
             else:
-                deadline = None if limit == math.inf else make_deadline(self.spec, limit, begun)
+                import_before_limit(self.spec, deadline)
                 tol, max_iter = check_arguments(self.spec, tol, max_iter, history, callback)
                 solution = self._solve(
                     original, impulse, tol, max_iter, deadline, history, callback, failed_call
@@ -322,7 +319,7 @@ class Prepared:
         impulse: Any,
         tol: float,
         max_iter: int,
-        deadline: Deadline | None = None,
+        deadline: Deadline = NEVER,
         history: bool = False,
         callback: Callback | None = None,
         failed_call: tuple[int, ...] | None = None,
@@ -359,7 +356,7 @@ class Prepared:
         if setup.solver is not None:
             setup.is_used = True
             loop.solver, loop.state = setup.solver, setup.state
-            if deadline is not None:
+            if deadline.is_set:
                 self._start_workers(setup, deadline)
                 if self.spec.builtin and not self.spec.external:
                     reserve_time_of_judge(problem, deadline)
@@ -380,7 +377,7 @@ class Prepared:
 
     # -- set-up ----------------------------------------------------------------------------------
 
-    def _set_up(self, original: Problem, deadline: Deadline | None) -> SetUp:
+    def _set_up(self, original: Problem, deadline: Deadline = NEVER) -> SetUp:
         """Set the solver up for a problem, unless the deadline has passed; reuse its state for the same structure.
 
         The problem replaces the old one unless an error is raised.
@@ -401,13 +398,9 @@ class Prepared:
         setup = SetUp()
         if solver is None:
             solver = _make_solver(spec, self.options)
-        if deadline is None or not deadline.has_passed():
+        if not deadline.has_passed():
             try:
-                with (
-                    limit_forming(deadline)
-                    if deadline is not None and deadline.is_set
-                    else UNLIMITED
-                ):
+                with limit_forming(deadline) if deadline.is_set else UNLIMITED:
                     if last.solver is not None and (
                         not is_other or same_structure(self.problem.disk, problem)
                     ):
@@ -453,7 +446,6 @@ class Prepared:
     def _decide_without_solver(self, loop: Loop, setup: SetUp, max_iter: int) -> Claim | None:
         """Return the claim of a problem that no solver can or may solve; else None."""
         problem = loop.problem
-        deadline = loop.deadline
         if len(problem.metric.empty):
             proof = decide_empty_rows(problem, loop.impulse, loop.tol)
             if proof is not None:
@@ -462,8 +454,7 @@ class Prepared:
                 return self._solve_with_zero_b(loop, claim, impossible, max_iter)
         if setup.failure:
             return Claim(NUMERICAL_ERROR, 0, {}, setup.failure)
-        is_late = deadline is not None and deadline.has_passed() and not self.spec.external
-        if setup.solver is None or is_late:
+        if setup.solver is None or (loop.deadline.has_passed() and not self.spec.external):
             loop.keep_start()
             return Claim(TIME_LIMIT, 0)
         return None
@@ -530,7 +521,7 @@ class Prepared:
                 solve_time=loop.time,
                 history=None if loop.records is None else loop.get_history(),
                 sweeps_per_decade=float(getattr(loop.state, "sweeps_per_decade", math.nan)),
-                deadline=loop.deadline or NEVER,
+                deadline=loop.deadline,
             )
         )
 
@@ -553,9 +544,8 @@ class Prepared:
 
     def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
         """Solve with b = 0 on rows that cannot be met, so that other islands get an impulse; return the same claim."""
-        deadline = loop.deadline
         max_iter -= claim.iterations
-        if loop.tol == 0.0 or max_iter < 0 or (deadline is not None and deadline.has_passed()):
+        if loop.tol == 0.0 or max_iter < 0 or loop.deadline.has_passed():
             return claim
         problem = loop.problem
         start = loop.impulse.copy()
@@ -565,7 +555,7 @@ class Prepared:
             others = Prepared(problem.updated(b=b), self.spec, self.options)
         except InputError:  # The remaining entries of b are below the accepted range.
             return claim
-        left = None if deadline is None else deadline.get_remaining_seconds(MIN_TIME_LIMIT)
+        left = loop.deadline.get_remaining_seconds(MIN_TIME_LIMIT)
         solution = others.solve(impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=left)
         impulses = (solution.impulse,)
         loop.impulse[:] = combine_best_islands(

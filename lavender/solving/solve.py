@@ -6,20 +6,18 @@ for plain arguments itself, and calls the function below for all others.
 
 from __future__ import annotations
 
-import math
 from functools import update_wrapper
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
 
 from lavender.base.arrays import ArrayLike
-from lavender.base.deadline import Deadline, read_clock
 from lavender.base.errors import InputError
 from lavender.judge.solution import Solution
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import SolverSpec, get, registered
 from lavender.solving.compiled_call import solve_small
-from lavender.solving.limits import check_time_limit, make_deadline
+from lavender.solving.limits import import_before_limit, start_limit
 from lavender.solving.loop import Callback
 from lavender.solving.prepared import Prepared, check_arguments
 from lavender.solving.velocity import accept_velocity, relative_tolerance
@@ -101,17 +99,15 @@ def solve(
             "all others by name: lavender.solve(problem, solver, tol=..., impulse=...)"
         )
     spec = get(solver) if isinstance(solver, str) else _reject_solver(solver)
-    begun = 0.0 if time_limit is None else read_clock()  # After the import of a plug-in.
-    limit = math.inf if time_limit is None else check_time_limit(time_limit)
+    deadline = start_limit(time_limit)  # After the import of a plug-in.
     if velocity_tol is not None:
         tol = relative_tolerance(problem, velocity_tol, tol)
     solution: Solution | None = None
     failed_call: tuple[int, ...] | None = None
     if max_iter is None and callback is None and history is False and not options:
-        deadline = None if limit == math.inf else Deadline(limit, begun)
         solution, failed_call = solve_small(problem, spec, impulse, tol, deadline)
     if solution is None:
-        deadline = None if limit == math.inf else make_deadline(spec, limit, begun)
+        import_before_limit(spec, deadline)
         prepared = Prepared(problem, spec, cast("dict[str, Any]", options), False)
         tol, max_iter = check_arguments(spec, tol, max_iter, history, callback)
         solution = prepared._solve(

@@ -230,7 +230,7 @@ class Iterations(Step):
             state=self.state,
             impulse=self.impulse,
             tol=log.tol,
-            deadline=None if left is None else deadline,
+            deadline=deadline,
             records=None if log.recorder is None else [],
         )
         begun = 0.0 if log.recorder is None else log.recorder.time

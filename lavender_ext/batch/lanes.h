@@ -61,168 +61,75 @@ static void lavender_list_columns(unsigned long long set, int* list) {
 #else
 #define LAVENDER_APART
 #endif
-#define LAVENDER_CHOOSE(V, I, mask, a, b) ((mask) ? (a) : (b))
-#define LAVENDER_FABS(V, I, a) fabs(a)
-#define LAVENDER_PICK(V, I, mask, a, b) (V)(((mask) & (I)(a)) | (~(mask) & (I)(b)))
-#define LAVENDER_ABS(V, I, a) (V)((I)(a) & 0x7FFFFFFFFFFFFFFFLL)
+#define LAVENDER_NAME_OF_WIDTH(f, width, more) f##_##width##more
+#define LAVENDER_NAME(f, width, more) LAVENDER_NAME_OF_WIDTH(f, width, more)
 
 #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
-#define LAVENDER_VECTOR(N, V, I) \
-    typedef double V __attribute__((vector_size(8 * N), aligned(8), may_alias)); \
-    typedef long long I __attribute__((vector_size(8 * N), aligned(8), may_alias));
-LAVENDER_VECTOR(2, lanes_2, mask_2)
-
-#define LANE(f) f##_1
+#define LAVENDER_VECTOR(N) \
+    typedef double lanes_##N __attribute__((vector_size(8 * N), aligned(8), may_alias)); \
+    typedef long long mask_##N __attribute__((vector_size(8 * N), aligned(8), may_alias));
+LAVENDER_VECTOR(2)
+#ifdef LAVENDER_GENERIC_LANES
+#define LAVENDER_FEWEST_LANES 8
+#else
+#define LAVENDER_FEWEST_LANES 2
+#endif
+#define LAVENDER_IN_ALL_LANES(width, name, arguments) \
+    ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
 #define WIDTH 1
-#define V double
-#define I long long
-#define ISA
-#define ROOT(a) sqrt(a)
-#define PICK LAVENDER_CHOOSE
-#define ABS LAVENDER_FABS
-#define ANY(mask) ((mask) != 0)
-#define OF_WORLDS 0
 #include "lanes_body.h"
 
 /* With LAVENDER_GENERIC_LANES the compiler makes all widths of the instructions that every processor has. */
-#if defined(__x86_64__) || defined(LAVENDER_GENERIC_LANES)
-LAVENDER_VECTOR(4, lanes_4, mask_4)
-LAVENDER_VECTOR(8, lanes_8, mask_8)
-#endif
-#if defined(__x86_64__) && !defined(LAVENDER_GENERIC_LANES)
-#include <immintrin.h>
-
-#define LANE(f) f##_2
+#ifdef LAVENDER_GENERIC_LANES
+LAVENDER_VECTOR(4)
+LAVENDER_VECTOR(8)
+#define LAVENDER_IN_LANES LAVENDER_IN_ALL_LANES
 #define WIDTH 2
-#define V lanes_2
-#define I mask_2
-#define ISA
+#include "lanes_body.h"
+#define WIDTH 4
+#include "lanes_body.h"
+#define WIDTH 8
+#include "lanes_body.h"
+#elif defined(__x86_64__)
+#include <immintrin.h>
+LAVENDER_VECTOR(4)
+LAVENDER_VECTOR(8)
+#define LAVENDER_IN_LANES LAVENDER_IN_ALL_LANES
+#define WIDTH 2
 #define ROOT(a) ((lanes_2)_mm_sqrt_pd((__m128d)(a)))
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
 #define ANY(mask) (_mm_movemask_pd((__m128d)(mask)) != 0)
-#define OF_WORLDS 1
 #include "lanes_body.h"
 
-#define LANE(f) f##_4
 #define WIDTH 4
-#define V lanes_4
-#define I mask_4
 #define ISA __attribute__((target("avx2")))
 #define ROOT(a) ((lanes_4)_mm256_sqrt_pd((__m256d)(a)))
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
 #define ANY(mask) (_mm256_movemask_pd((__m256d)(mask)) != 0)
-#define OF_WORLDS 1
 #include "lanes_body.h"
 
-#define LANE(f) f##_8
 #define WIDTH 8
-#define V lanes_8
-#define I mask_8
 #define ISA LAVENDER_AVX512
 #define ROOT(a) ((lanes_8)_mm512_sqrt_pd((__m512d)(a)))
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
 #define ANY(mask) (_mm512_movepi64_mask((__m512i)(mask)) != 0)
-#define OF_WORLDS 1
 #include "lanes_body.h"
 
-#define LANE(f) f##_1_avx2
 #define WIDTH 1
-#define V double
-#define I long long
+#define MORE _avx2
 #define ISA __attribute__((target("avx2")))
-#define ROOT(a) sqrt(a)
-#define PICK LAVENDER_CHOOSE
-#define ABS LAVENDER_FABS
-#define ANY(mask) ((mask) != 0)
-#define OF_WORLDS 0
 #include "lanes_body.h"
-
 #define lavender_solve_one(x, wide) ((wide) ? solve_1_avx2(x) : solve_1(x))
-#define LAVENDER_IN_LANES(width, name, arguments) \
-    ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
-#else
-#define LAVENDER_ROOT_AND_ANY(N, V, I) \
-    static inline V roots_##N(V a) { \
-        for (int i = 0; i < N; i++) a[i] = sqrt(a[i]); \
-        return a; \
-    } \
-    static inline int some_##N(I mask) { \
-        long long bits = 0; \
-        for (int i = 0; i < N; i++) bits |= mask[i]; \
-        return bits != 0; \
-    }
-LAVENDER_ROOT_AND_ANY(2, lanes_2, mask_2)
-
-#define LANE(f) f##_2
-#define WIDTH 2
-#define V lanes_2
-#define I mask_2
-#define ISA
-#define ROOT(a) roots_2(a)
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
-#define ANY(mask) some_2(mask)
-#define OF_WORLDS 1
-#include "lanes_body.h"
-
-#define lavender_solve_one(x, wide) solve_1(x)
-#ifdef LAVENDER_GENERIC_LANES
-LAVENDER_ROOT_AND_ANY(4, lanes_4, mask_4)
-LAVENDER_ROOT_AND_ANY(8, lanes_8, mask_8)
-
-#define LANE(f) f##_4
-#define WIDTH 4
-#define V lanes_4
-#define I mask_4
-#define ISA
-#define ROOT(a) roots_4(a)
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
-#define ANY(mask) some_4(mask)
-#define OF_WORLDS 1
-#include "lanes_body.h"
-
-#define LANE(f) f##_8
-#define WIDTH 8
-#define V lanes_8
-#define I mask_8
-#define ISA
-#define ROOT(a) roots_8(a)
-#define PICK LAVENDER_PICK
-#define ABS LAVENDER_ABS
-#define ANY(mask) some_8(mask)
-#define OF_WORLDS 1
-#include "lanes_body.h"
-
-#define LAVENDER_IN_LANES(width, name, arguments) \
-    ((width) == 8 ? name##_8 arguments : (width) == 4 ? name##_4 arguments : name##_2 arguments)
-#define LAVENDER_FEWEST_LANES 8
 #else
 #define LAVENDER_IN_LANES(width, name, arguments) name##_2 arguments
-#endif
-#endif
-#ifndef LAVENDER_FEWEST_LANES
-#define LAVENDER_FEWEST_LANES 2
+#define WIDTH 2
+#include "lanes_body.h"
 #endif
 #else
-#define LANE(f) f##_1
-#define WIDTH 1
-#define V double
-#define I long long
-#define ISA
-#define ROOT(a) sqrt(a)
-#define PICK LAVENDER_CHOOSE
-#define ABS LAVENDER_FABS
-#define ANY(mask) ((mask) != 0)
-#define OF_WORLDS 1
-#include "lanes_body.h"
-
-#define lavender_solve_one(x, wide) solve_1(x)
-#define LAVENDER_IN_LANES(width, name, arguments) name##_1 arguments
 #define LAVENDER_FEWEST_LANES 1
+#define LAVENDER_IN_LANES(width, name, arguments) name##_1 arguments
+#define WIDTH 1
+#include "lanes_body.h"
+#endif
+#ifndef lavender_solve_one
+#define lavender_solve_one(x, wide) solve_1(x)
 #endif
 #define lavender_prepare_lanes(x, width) LAVENDER_IN_LANES(width, prepare, (x))
 #define lavender_solve_lanes(x, width) LAVENDER_IN_LANES(width, solve, (x))

@@ -8,22 +8,67 @@
  *
  * Lanes that are finished stay in the loop with a mask `on`. A world has the same bits in every lane and width.
  *
- * lanes.h defines the following names, and this file removes them at its end.
+ * lanes.h defines WIDTH, the number of lanes, and for some widths the following names; this file removes all at its end.
  *
- *     LANE(f)     name of function f of this width, such as f_4
- *     WIDTH       number of lanes
- *     V, I        vector of doubles, and of masks: all bits of an entry are set or none
+ *     MORE        end of the names of functions, if another file of this width exists
  *     ISA         attribute that selects the instructions
- *     ROOT(a), PICK(V, I, mask, a, b), ABS(V, I, a), ANY(mask)
- *     OF_WORLDS   1: also the functions that convert, solve and judge worlds in lanes
+ *     ROOT(a), ANY(mask)      their instructions
+ *
+ * Here V and I are the vectors of doubles and of masks, in which all bits of an entry are set or none, and LANE(f) is the
+ * name of function f, such as f_4.
  */
+#ifndef ISA
+#define ISA
+#endif
+#ifndef MORE
+#define MORE
+#endif
+#define LANE(f) LAVENDER_NAME(f, WIDTH, MORE)
+#if WIDTH == 1
+#define V double
+#define I long long
+#else
+#define V LAVENDER_NAME(lanes, WIDTH, )
+#define I LAVENDER_NAME(mask, WIDTH, )
+#endif
 
-ISA static inline V LANE(pick)(I mask, V a, V b) { return PICK(V, I, mask, a, b); }
-ISA static inline V LANE(larger)(V a, V b) { return PICK(V, I, (I)(a > b), a, b); }
+ISA static inline V LANE(pick)(I mask, V a, V b) {
+#if WIDTH == 1
+    return mask ? a : b;
+#else
+    return (V)((mask & (I)a) | (~mask & (I)b));
+#endif
+}
+ISA static inline V LANE(larger)(V a, V b) { return LANE(pick)((I)(a > b), a, b); }
 ISA static inline V LANE(clip)(V a, V low, V high) { return LANE(pick)((I)(a < low), low, LANE(pick)((I)(a > high), high, a)); }
-ISA static inline V LANE(abs)(V a) { return ABS(V, I, a); }
-ISA static inline V LANE(root)(V a) { return ROOT(a); }
-ISA static inline int LANE(any)(I mask) { return ANY(mask); }
+ISA static inline V LANE(abs)(V a) {
+#if WIDTH == 1
+    return fabs(a);
+#else
+    return (V)((I)a & 0x7FFFFFFFFFFFFFFFLL);
+#endif
+}
+ISA static inline V LANE(root)(V a) {
+#ifdef ROOT
+    return ROOT(a);
+#elif WIDTH == 1
+    return sqrt(a);
+#else
+    for (int i = 0; i < WIDTH; i++) a[i] = sqrt(a[i]);
+    return a;
+#endif
+}
+ISA static inline int LANE(any)(I mask) {
+#ifdef ANY
+    return ANY(mask);
+#elif WIDTH == 1
+    return mask != 0;
+#else
+    long long bits = 0;
+    for (int i = 0; i < WIDTH; i++) bits |= mask[i];
+    return bits != 0;
+#endif
+}
 ISA static inline I LANE(all)(I mask) { return sizeof(V) == sizeof(double) ? (I)(0 - mask) : mask; }  /* all bits */
 
 /* The friction law at a normal yn and tangents of length t: the normal s of the point on the bounds that is nearest for a cone
@@ -437,7 +482,7 @@ ISA static void LANE(solve)(const lavender_lanes_t* x) {
     out[LANE_STEPS] = steps;
 }
 
-#if OF_WORLDS
+#if WIDTH > 1 || LAVENDER_FEWEST_LANES == 1
 
 /* Interleave n numbers from each of WIDTH arrays, of float if `narrow`, number i to place at[i]. */
 ISA static void LANE(interleave)(const void* const* from, int narrow, int n, const int* at, double* to) {
@@ -757,11 +802,9 @@ ISA static void LANE(judge)(const lavender_lanes_t* x) {
 #endif
 #undef LANE
 #undef WIDTH
+#undef MORE
 #undef V
 #undef I
 #undef ISA
 #undef ROOT
-#undef PICK
-#undef ABS
 #undef ANY
-#undef OF_WORLDS
