@@ -120,10 +120,16 @@ cdef inline double contact_normal_velocity(const engine_t* e, const double* v, i
     return dot3(e.normal + 3 * c, u)
 
 
+cdef inline int32_t count_most_sweeps(const engine_t* e) noexcept nogil:
+    """Return the largest number of sweeps of a projection."""
+    cdef int32_t n = e.head[H_POSITION_ITERATIONS]
+    return MAX_SWEEPS if e.setting[S_SLOP] == 0.0 and 0 < n < MAX_SWEEPS else n
+
+
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR of the poses before the substep."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], sweep, i, j, c, a, b, due = 0
-    cdef int32_t n_sweeps = e.head[H_POSITION_ITERATIONS], max_sweeps = n_sweeps
+    cdef int32_t n_sweeps = e.head[H_POSITION_ITERATIONS], max_sweeps = count_most_sweeps(e)
     cdef int32_t last_first = e.head[H_ORDER] == ALTERNATING and e.head[H_PHASE] & 1   # as the sweeps over velocities
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
     cdef double max_correction = e.setting[S_MAX_PUSH]
@@ -167,8 +173,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     # sweeps over joints, then contacts
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    if slop == 0.0 and 0 < n_sweeps < MAX_SWEEPS:
-        max_sweeps = MAX_SWEEPS
     for sweep in range(1, max_sweeps + 1):
         for i in range(e.size[N_JOINT]):
             project_joint(e, i, goal)                   # (2)
