@@ -24,14 +24,14 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, fin
 from lavender_ext.core.block_types cimport blocks_t, is_disk_friction_contact
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
-                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS,
+from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, COLORED_PAIRS,
+                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS,
                                          H_ORDER, H_PHASE, H_POSITION_ITERATIONS, H_PROJECTED, H_REBUILT, H_SEED, H_SOLVED,
                                          H_STEP, H_SUBSTEPS, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_BODY, N_DYNAMIC,
                                          N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_BETA,
                                          S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_MAX_PUSH, S_OUT, S_RECYCLE, S_SLOP, TOP_DOWN,
                                          bind_engine_arrays, engine_t)
-from lavender_ext.engine.bodies cimport advance_bodies, are_contacts_new, begin_body_substep
+from lavender_ext.engine.bodies cimport advance_bodies, are_contacts_new, begin_body_substep, get_sweep_direction
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport (build_contacts, find_due_bodies, finish_contacts, follow_gaps, renew_contacts,
                                             store_contact_cache)
@@ -120,11 +120,18 @@ cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
         reverse_blocks(e.order, 0, kj)
         reverse_blocks(e.order, kj, n)
     elif mode == ALTERNATING:
-        if e.head[H_PHASE] & 1:                         # The first substep of the step built the contacts in its order.
+        if get_sweep_direction(e):
+            reverse_blocks(e.order, kj, n)
+    elif mode == COLORED_PAIRS:
+        levels = color_blocks_by_bodies(n - kj, e.contact_body, nd, True, e.color_scratch, block_level)
+        sort_blocks_by_level(n - kj, block_level, levels, block_level + n, e.order + kj)
+        for i in range(kj, n):
+            e.order[i] += kj
+        if get_sweep_direction(e):
             reverse_blocks(e.order, kj, n)
     elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
         if mode == COLORED:
-            levels = color_blocks_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
+            levels = color_blocks_by_bodies(n, e.joint_body, nd, False, e.color_scratch, block_level)
         else:
             levels = find_block_levels(n, e.joint_body, nd, level, block_level)
         if mode == TOP_DOWN:
@@ -323,11 +330,6 @@ cdef struct packs_t:            # packed blocks of the substeps of a call: in od
     packed_t packed[2]          # pairs of blocks, for each order
     double* workspace[2]
     bint is_valid[2]
-
-
-cdef inline int32_t get_sweep_direction(const engine_t* e) noexcept nogil:
-    """Return 1 if the substep visits the contacts in the reverse of the order in which they are numbered, else 0."""
-    return e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
 
 
 cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, packs_t* packs) noexcept nogil:
@@ -580,6 +582,11 @@ cdef class Buffers:
             bind_substep_problem(&self.e, &p, &r)
             compute_velocity_change(&p, &r, self.e.impulse, self.e.dv)
             measure_contact_errors(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
+
+    def compute_sweep_order(self):
+        """Return the blocks (k,) of the prepared substep in the order of its first sweep."""
+        set_sweep_order_of_blocks(&self.e)
+        return np.array([self.e.order[i] for i in range(self.e.size[N_JOINT] + self.e.head[H_CONTACTS])], np.int32)
 
     def finish_substep(self):
         """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""

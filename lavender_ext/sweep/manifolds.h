@@ -65,10 +65,11 @@ typedef struct {
     lavender_rows* rows;
     double *x, *v, *free, *before;      /* (contacts + 1, 8) as `relax` tells; (bodies + 2, 8) velocities */
     lavender_four* own;                 /* (rows, 8) the same in lanes, or NULL: groups of several sweeps share a contact */
+    int32_t* own_at;                    /* (contacts) offset of the first number of each contact in own */
     lavender_four* push;                /* (rows, 4) required shift, multiplier and step of the position projection */
     double *d, *inverse;                /* (contacts + 1, 2) 1/kg; (bodies + 1, 12) inverse inertia */
-    void* place[10];                     /* allocated memory, and its sizes in bytes */
-    size_t size[10];
+    void* place[11];                     /* allocated memory, and its sizes in bytes */
+    size_t size[11];
 } lavender_manifolds;
 
 enum {
@@ -90,7 +91,7 @@ static void* lavender_reserve(lavender_manifolds* m, int k, size_t size) {
 }
 
 static void lavender_free_manifolds(lavender_manifolds* m) {
-    for (int k = 0; k < 10; k++) free(m->place[k]);
+    for (int k = 0; k < 11; k++) free(m->place[k]);
     memset(m, 0, sizeof *m);
 }
 
@@ -159,7 +160,7 @@ static int lavender_has_avx2(void) { return 0; }
 
 /* Write manifold `first` .. `first` + `count` of the order to a lane of a group, without its rows. */
 static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_t count, lavender_group* g, lavender_four* own,
-                               int lane) {
+                               int32_t* own_at, int lane) {
     const int32_t i = c->order[first], *body = c->body + 2 * i;
     const double *n = c->normal + 3 * i, *t = c->tangent + 3 * i;
     double* axis = (double*)g->axis + lane;
@@ -192,6 +193,7 @@ static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_
             p[4 * (3 + q)] = c->arm_b[3 * at + q];
         }
         if (!own) continue;
+        own_at[at] = 32 * (g->first_row + j) + lane;
         p = (double*)(own + 8 * j) + lane;
         for (int q = 0; q < 3; q++) p[4 * q] = c->impulse[3 * at + q];
         p[4 * 3] = c->gap[at];
@@ -329,14 +331,15 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     m->start = (size_t*)lavender_reserve(m, 2, sizeof(size_t) * every);
     m->groups = (char*)lavender_reserve(m, 3, most * every);
     m->own = NULL;
-    const int has_own = m->n_sweeps == 1 && m->along;
+    const int has_own = m->n_sweeps == 1;
     m->x = (double*)lavender_reserve(m, 4, has_own ? 4 * every * 8 * sizeof(lavender_four) : 8 * 8 * (n + 1));
     m->v = (double*)lavender_reserve(m, 5, 3 * 8 * 8 * (n_bodies + 2));
     m->d = (double*)lavender_reserve(m, 6, 8 * 2 * (n + 1));
     m->inverse = (double*)lavender_reserve(m, 7, 8 * 12 * (n_bodies + 1));
     m->rows = (lavender_rows*)lavender_reserve(m, 8, 4 * every * sizeof(lavender_rows));
     m->push = (lavender_four*)lavender_reserve(m, 9, 16 * (size_t)m->n_once * sizeof(lavender_four));
-    if (!(m->start && m->groups && m->x && m->v && m->d && m->inverse && m->rows && m->push)) return 0;
+    m->own_at = (int32_t*)lavender_reserve(m, 10, 4 * (n + 1));
+    if (!(m->start && m->groups && m->x && m->v && m->d && m->inverse && m->rows && m->push && m->own_at)) return 0;
     m->start_once = m->n_sweeps > 1 ? m->start + m->n_groups : m->start;
     m->free = m->v + 8 * (n_bodies + 2);
     m->before = m->free + 8 * (n_bodies + 2);
@@ -366,7 +369,7 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
         const int32_t stop = m->n_sweeps == 1 ? used[k] : (i + 4 < count ? i + 4 : count);
         for (int lane = 0; i < stop; lane++, i++) {
             const int32_t at = m->n_sweeps == 1 ? sorted[i] : i;
-            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, own, lane);
+            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, own, m->own_at, lane);
         }
         m->start_once[k] = bytes;
         bytes += lavender_close_group(c, g, m->rows + row, own);
@@ -424,10 +427,12 @@ static void lavender_refresh_manifolds(const lavender_contacts* c, lavender_mani
     t->wrench = t->warm && in_lanes ? v : NULL;
     lavender_run_groups(wide, m, LAVENDER_REFRESH, m->along < 0, t);
     for (int32_t i = 0; i < c->n && t->warm && !in_lanes; i++) {
-        const double *n = c->normal + 3 * i, *s = c->tangent + 3 * i, *x = m->x + 8 * (size_t)i;
+        const double *n = c->normal + 3 * i, *s = c->tangent + 3 * i;
+        const double* x = m->own ? (const double*)m->own + m->own_at[i] : m->x + 8 * (size_t)i;
+        const size_t next = m->own ? 4 : 1;
         const double u[3] = {n[1] * s[2] - n[2] * s[1], n[2] * s[0] - n[0] * s[2], n[0] * s[1] - n[1] * s[0]};
         double f[3];
-        for (int k = 0; k < 3; k++) f[k] = (x[0] * n[k] + x[1] * s[k]) + x[2] * u[k];
+        for (int k = 0; k < 3; k++) f[k] = (x[0] * n[k] + x[next] * s[k]) + x[2 * next] * u[k];
         for (int side = 0; side < 2; side++) {
             const int32_t body = c->body[2 * i + side];
             const double* r = (side ? c->arm_b : c->arm_a) + 3 * i;
