@@ -30,5 +30,5 @@ cdef int32_t find_block_levels(int32_t n_blocks, const int32_t* body, int32_t n_
                                int32_t* out) noexcept nogil
 cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
                                int32_t* order) noexcept nogil
-cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, bint by_pair, uint64_t* used,
                                     int32_t* color) noexcept nogil

@@ -91,10 +91,11 @@ cdef void sort_blocks_by_level(int32_t n_blocks, const int32_t* level, int32_t n
             order[start[level[i]]] = i
 
 
-cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, bint by_pair, uint64_t* used,
                                     int32_t* color) noexcept nogil:
     """Colour blocks greedily so that no two blocks of one colour share a moving body; return the number of colours.
 
+    With `by_pair`, successive blocks of the same two bodies have one colour, and only these share a body.
     `used` (n_bodies) holds one bit per colour of the current group of 63 colours. Blocks without a free bit are coloured in
     the next group.
     """
@@ -110,6 +111,10 @@ cdef int32_t color_blocks_by_bodies(int32_t n_blocks, const int32_t* body, int32
                 continue
             a = body[2 * i]
             b = body[2 * i + 1]
+            if by_pair and i > 0 and color[i - 1] >= 0 and a == body[2 * i - 2] and b == body[2 * i - 1]:
+                color[i] = color[i - 1]
+                uncoloured -= 1
+                continue
             occupied = 0
             if a >= 0:
                 occupied |= used[a]
@@ -173,7 +178,7 @@ def compute_body_colors(const int32_t[:, ::1] body, int n_bodies):
     cdef uint64_t[::1] used = np.zeros(n_bodies + 1, np.uint64)
     cdef int32_t[::1] color = np.empty(k + 1, np.int32)
     if k:
-        color_blocks_by_bodies(k, &body[0, 0], n_bodies, &used[0], &color[0])
+        color_blocks_by_bodies(k, &body[0, 0], n_bodies, False, &used[0], &color[0])
     return np.asarray(color)[:k]
 
 

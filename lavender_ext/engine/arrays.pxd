@@ -64,6 +64,7 @@ cpdef enum:
     TOP_DOWN = 5
     COLORED = 6
     ALTERNATING = 7         # as given; in odd substeps contacts are built from the last pair to the first
+    COLORED_PAIRS = 8       # colour by colour, all contacts of a pair in one colour; in odd substeps reversed
 
 # setting[]: real settings; the engine writes the entries from S_OUT to S_JOINT_ERROR
 cpdef enum:

@@ -15,8 +15,8 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.validate cimport find_invalid_number
-from lavender_ext.engine.arrays cimport (H_KEPT, H_PHASE, N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H,
-                                         engine_t)
+from lavender_ext.engine.arrays cimport (ALTERNATING, COLORED_PAIRS, H_KEPT, H_ORDER, H_PHASE, H_STEP, N_BODY, N_DYNAMIC, N_FRAME,
+                                         S_GRAVITY, S_H, engine_t)
 from lavender_ext.core.vectors cimport copy3, add_scaled3, matvec3
 
 
@@ -107,6 +107,16 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
 cdef inline int32_t are_contacts_new(const engine_t* e) noexcept nogil:
     """Return whether the coming substep builds all contacts anew."""
     return e.head[H_PHASE] == 0 and not e.head[H_KEPT]
+
+
+cdef inline int32_t get_sweep_direction(const engine_t* e) noexcept nogil:
+    """Return 1 if the substep visits the contacts in reverse, else 0; the order of reference is that of their numbers or colours.
+
+    Under the alternating order, the first substep of the step has numbered the contacts in its order.
+    """
+    if e.head[H_ORDER] == COLORED_PAIRS:
+        return e.head[H_STEP] & 1
+    return e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
 
 
 cdef inline void begin_body_substep(engine_t* e) noexcept nogil:

@@ -26,10 +26,10 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport project_normal_update
 from lavender_ext.core.rows cimport (dot3, dot12, apply_joint_impulse, joint_row_velocity, apply_impulse_to_body,
                                      compute_relative_velocity)
-from lavender_ext.engine.arrays cimport (ALTERNATING, H_CONTACTS, H_ORDER, H_PHASE,
-                                         H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
+from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
+from lavender_ext.engine.bodies cimport get_sweep_direction
 from lavender_ext.engine.joints cimport compute_row_curvature
 from lavender_ext.core.vectors cimport scale3
 
@@ -120,11 +120,17 @@ cdef inline double contact_normal_velocity(const engine_t* e, const double* v, i
     return dot3(e.normal + 3 * c, u)
 
 
+cdef inline int32_t count_most_sweeps(const engine_t* e) noexcept nogil:
+    """Return the largest number of sweeps of a projection."""
+    cdef int32_t n = e.head[H_POSITION_ITERATIONS]
+    return MAX_SWEEPS if e.setting[S_SLOP] == 0.0 and 0 < n < MAX_SWEEPS else n
+
+
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR of the poses before the substep."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], sweep, i, j, c, a, b, due = 0
-    cdef int32_t n_sweeps = e.head[H_POSITION_ITERATIONS], max_sweeps = n_sweeps
-    cdef int32_t last_first = e.head[H_ORDER] == ALTERNATING and e.head[H_PHASE] & 1   # as the sweeps over velocities
+    cdef int32_t n_sweeps = e.head[H_POSITION_ITERATIONS], max_sweeps = count_most_sweeps(e)
+    cdef int32_t last_first = get_sweep_direction(e)   # as the sweeps over velocities
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
     cdef double max_correction = e.setting[S_MAX_PUSH]
     cdef double depth = 0.0, joint_error = 0.0, x, new_multiplier, change, before = 0.0, after
@@ -167,8 +173,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     # sweeps over joints, then contacts
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
-    if slop == 0.0 and 0 < n_sweeps < MAX_SWEEPS:
-        max_sweeps = MAX_SWEEPS
     for sweep in range(1, max_sweeps + 1):
         for i in range(e.size[N_JOINT]):
             project_joint(e, i, goal)                   # (2)

@@ -24,26 +24,26 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, update_sweep_order, fin
 from lavender_ext.core.block_types cimport blocks_t, is_disk_friction_contact
 from lavender_ext.core.velocity cimport compute_velocity_change
 from lavender_ext.core.view cimport rows_t
-from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
-                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS,
+from lavender_ext.engine.arrays cimport (ALTERNATING, AT_RANDOM, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, COLORED_PAIRS,
+                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_NEED_CONTACTS, H_NEED_PAIRS,
                                          H_ORDER, H_PHASE, H_POSITION_ITERATIONS, H_PROJECTED, H_REBUILT, H_SEED, H_SOLVED,
                                          H_STEP, H_SUBSTEPS, H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_BODY, N_DYNAMIC,
                                          N_JOINT, N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SYMMETRICALLY, S_BETA,
-                                         S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_OUT, S_RECYCLE, S_SLOP, TOP_DOWN,
+                                         S_BOUNCE, S_DEPTH, S_H, S_JOINT_ERROR, S_MAX_PUSH, S_OUT, S_RECYCLE, S_SLOP, TOP_DOWN,
                                          bind_engine_arrays, engine_t)
-from lavender_ext.engine.bodies cimport advance_bodies, are_contacts_new, begin_body_substep
+from lavender_ext.engine.bodies cimport advance_bodies, are_contacts_new, begin_body_substep, get_sweep_direction
 from lavender_ext.engine.broad_phase cimport update_pair_list
 from lavender_ext.engine.contacts cimport (build_contacts, find_due_bodies, finish_contacts, follow_gaps, renew_contacts,
                                             store_contact_cache)
 from lavender_ext.engine.joints cimport build_joint_rows, store_joint_impulses
-from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
+from lavender_ext.engine.projection cimport contact_normal_velocity, count_most_sweeps, project_positions
 from lavender_ext.engine.view cimport bind_substep_problem
 from lavender_ext.judge.measure cimport score_given_slack
 from lavender_ext.judge.score cimport make_empty_score, score_t
 from lavender_ext.judge.slack cimport compute_body_slack
 from lavender_ext.sweep.manifolds cimport (HAS_MANIFOLDS, check_manifolds, contacts_t, follow_manifolds, free_manifolds, has_avx2,
-                                           manifolds_t, pack_manifolds, refresh_manifolds, store_manifolds, store_velocities,
-                                           sweep_manifolds, targets_t)
+                                           manifolds_t, pack_manifolds, project_manifolds, refresh_manifolds, store_manifolds,
+                                           store_velocities, sweep_along, sweep_manifolds, targets_t)
 from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, pack_blocks_in_order, packed_t, packed_workspace_size,
                                         refresh_packed_contacts, sweep_packed)
 from lavender_ext.sweep.pgs cimport sweep_bodies
@@ -120,11 +120,18 @@ cdef inline void set_sweep_order_of_blocks(engine_t* e) noexcept nogil:
         reverse_blocks(e.order, 0, kj)
         reverse_blocks(e.order, kj, n)
     elif mode == ALTERNATING:
-        if e.head[H_PHASE] & 1:                         # The first substep of the step built the contacts in its order.
+        if get_sweep_direction(e):
+            reverse_blocks(e.order, kj, n)
+    elif mode == COLORED_PAIRS:
+        levels = color_blocks_by_bodies(n - kj, e.contact_body, nd, True, e.color_scratch, block_level)
+        sort_blocks_by_level(n - kj, block_level, levels, block_level + n, e.order + kj)
+        for i in range(kj, n):
+            e.order[i] += kj
+        if get_sweep_direction(e):
             reverse_blocks(e.order, kj, n)
     elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
         if mode == COLORED:
-            levels = color_blocks_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
+            levels = color_blocks_by_bodies(n, e.joint_body, nd, False, e.color_scratch, block_level)
         else:
             levels = find_block_levels(n, e.joint_body, nd, level, block_level)
         if mode == TOP_DOWN:
@@ -325,11 +332,6 @@ cdef struct packs_t:            # packed blocks of the substeps of a call: in od
     bint is_valid[2]
 
 
-cdef inline int32_t get_sweep_direction(const engine_t* e) noexcept nogil:
-    """Return 1 if the substep visits the contacts in the reverse of the order in which they are numbered, else 0."""
-    return e.head[H_PHASE] & 1 if e.head[H_ORDER] == ALTERNATING else 0
-
-
 cdef inline bint sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, packs_t* packs) noexcept nogil:
     """Run the sweeps over pairs of blocks, with the same bits, and return True, or return False if they cannot be packed.
 
@@ -387,69 +389,78 @@ cdef inline bint enter_lanes(engine_t* e, const blocks_t* p, packs_t* packs) noe
     return packs.has_manifolds
 
 
-cdef inline void store_lanes(engine_t* e, packs_t* packs, bint rows, int32_t first_target) noexcept nogil:
-    """Write impulses, gaps, and with `rows` also the rows, and targets from first_target on, to the engine's arrays."""
+cdef inline void store_lanes(engine_t* e, packs_t* packs, bint rows) noexcept nogil:
+    """Write impulses, gaps, and with `rows` also the rows to the engine's arrays."""
     cdef contacts_t c = bind_contacts(e)
-    store_manifolds(&c, &packs.manifolds, rows, first_target)
+    store_manifolds(&c, &packs.manifolds, rows)
     packs.stored = packs.stored or rows
+
+
+cdef inline targets_t bind_targets(const engine_t* e) noexcept nogil:
+    """Return the settings that the groups need."""
+    cdef targets_t t
+    t.h, t.beta, t.slop, t.bounce = e.setting[S_H], e.setting[S_BETA], e.setting[S_SLOP], e.setting[S_BOUNCE]
+    t.max_push, t.warm = e.setting[S_MAX_PUSH], e.head[H_WARM_START]
+    t.most, t.finite = 0.0, True
+    return t
 
 
 cdef inline void solve_in_lanes(engine_t* e, packs_t* packs, bint measures) noexcept nogil:
     """Complete and solve the substep's problem in the groups; with `measures`, write it to the arrays, and measure its errors."""
     cdef contacts_t c = bind_contacts(e)
-    cdef targets_t t
+    cdef targets_t t = bind_targets(e)
     cdef bint wide = packs.lanes == 4
-    t.h, t.beta, t.slop, t.bounce = e.setting[S_H], e.setting[S_BETA], e.setting[S_SLOP], e.setting[S_BOUNCE]
-    t.warm = e.head[H_WARM_START]
     refresh_manifolds(&c, &packs.manifolds, wide, &t, e.v_free, e.v, e.body_of)
     if measures:
         set_sweep_order_of_blocks(e)
-        store_lanes(e, packs, True, 0)
+        store_lanes(e, packs, True)
         store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
         measure_contact_errors(e, e.setting + S_OUT + 4, e.setting + S_OUT + 6)
     sweep_manifolds(&packs.manifolds, wide, e.head[H_ITERATIONS], get_sweep_direction(e) != packs.way)
     store_velocities(c.n_bodies, packs.manifolds.v, e.dv)
     if measures:
-        store_lanes(e, packs, False, 0)
+        store_lanes(e, packs, False)
         measure_contact_errors(e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
 
 
 cdef inline int32_t finish_in_lanes(engine_t* e, packs_t* packs, bint last) noexcept nogil:
     """Do what `finish_substep` does after `solve_in_lanes`, with the same bits; arrays that no substep reads only if `last`."""
     cdef contacts_t c = bind_contacts(e)
-    cdef int finite
-    cdef double depth = check_manifolds(&c, &packs.manifolds, &finite)
-    cdef bint projects = depth > e.setting[S_SLOP] and e.head[H_POSITION_ITERATIONS] > 0
+    cdef targets_t t = bind_targets(e)
     cdef bint ends = e.head[H_PHASE] + 1 >= e.head[H_SUBSTEPS], recycles = e.setting[S_RECYCLE] > 0.0
-    cdef int32_t shifted = 0, nonfinite_body = -1, any_due = 0
+    cdef bint wide = packs.lanes == 4
+    cdef int32_t shifted = 0, nonfinite_body = -1, any_due = 0, n_sweeps = e.head[H_POSITION_ITERATIONS]
+    cdef double depth
+    check_manifolds(&packs.manifolds, wide, &t)
+    depth = t.most
     store_statistics(e)
     # projection, integration
-    if not finite or not all_finite(e.setting + S_OUT, 8):
-        store_lanes(e, packs, True, 0)
+    if not t.finite or not all_finite(e.setting + S_OUT, 8):
+        store_lanes(e, packs, True)
         nonfinite_body = find_nonfinite_body(e)
-    if projects:
-        store_lanes(e, packs, not packs.stored, 0)
-        shifted = project_positions(e)
-    else:
+    if not depth > e.setting[S_SLOP] or n_sweeps == 0 or sweep_along(&packs.manifolds):
         e.head[H_PROJECTED] = 0
         e.setting[S_DEPTH] = depth
         e.setting[S_JOINT_ERROR] = 0.0
+        if depth > e.setting[S_SLOP] and n_sweeps > 0:
+            e.head[H_PROJECTED] = project_manifolds(&c, &packs.manifolds, wide, &t, n_sweeps, count_most_sweeps(e),
+                                                    get_sweep_direction(e), e.v_free, e.dv, e.shift)
+            shifted = e.head[H_PROJECTED] > 0
+    else:
+        store_lanes(e, packs, not packs.stored)
+        shifted = project_positions(e)
     e.head[H_LOST] = advance_bodies(e, shifted)
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = nonfinite_body
     # gaps and cache for the next substep
     if not ends or recycles:
         any_due = find_due_bodies(e, shifted, ends)
-        follow_manifolds(&c, &packs.manifolds, packs.lanes == 4, e.shift)
-    if any_due and not ends:
-        # Contacts that end here leave their rows in the arrays. The projection has used the first targets.
-        store_lanes(e, packs, True, e.head[H_CONTACTS] if projects else 0)
-    elif any_due or ends and (last or not recycles):
-        store_lanes(e, packs, False, 0)
+        follow_manifolds(&c, &packs.manifolds, wide, e.shift)
     if any_due or ends and (last or not recycles):
+        store_lanes(e, packs, False)
         store_contact_cache(e)
     if e.head[H_LOST] >= 0:
-        store_lanes(e, packs, not packs.stored, 0)
+        store_lanes(e, packs, not packs.stored)
     return end_substep(e)
 
 
@@ -478,7 +489,7 @@ cdef inline int32_t run_packed_substeps(engine_t* e, int32_t n, packs_t* packs, 
         status = prepare_contacts(e, &p, &r)
         if status != OK:
             if packs.has_manifolds:
-                store_lanes(e, packs, not packs.stored, 0)
+                store_lanes(e, packs, not packs.stored)
         elif enter_lanes(e, &p, packs):
             solve_in_lanes(e, packs, last)
             status = finish_in_lanes(e, packs, last)
@@ -571,6 +582,11 @@ cdef class Buffers:
             bind_substep_problem(&self.e, &p, &r)
             compute_velocity_change(&p, &r, self.e.impulse, self.e.dv)
             measure_contact_errors(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
+
+    def compute_sweep_order(self):
+        """Return the blocks (k,) of the prepared substep in the order of its first sweep."""
+        set_sweep_order_of_blocks(&self.e)
+        return np.array([self.e.order[i] for i in range(self.e.size[N_JOINT] + self.e.head[H_CONTACTS])], np.int32)
 
     def finish_substep(self):
         """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""

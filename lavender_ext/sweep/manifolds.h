@@ -20,9 +20,13 @@ typedef struct {                        /* contacts with a normal and two tangen
     double *b, *target, *d, *step, *coupling, *inv_inertia_arm;     /* rows that `lavender_store_manifolds` writes */
 } lavender_contacts;
 
-typedef struct {                        /* what the right-hand sides depend on, see engine/contacts.pxd */
-    double h, beta, slop, bounce;
+typedef struct {                        /* what a pass over the groups needs besides them, and what it finds */
+    double h, beta, slop, bounce, max_push;                     /* see engine/contacts.pxd and engine/projection.pxd */
     int warm;
+    const double* before;               /* (bodies + 2, 8) velocities before the substep, or NULL */
+    double* wrench;                     /* (bodies + 2, 8) receives J^T lam, or NULL */
+    double most;                        /* largest depth [m], required shift or part of it that is missing */
+    int finite, due;
 } lavender_targets;
 
 #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
@@ -61,12 +65,16 @@ typedef struct {
     lavender_rows* rows;
     double *x, *v, *free, *before;      /* (contacts + 1, 8) as `relax` tells; (bodies + 2, 8) velocities */
     lavender_four* own;                 /* (rows, 8) the same in lanes, or NULL: groups of several sweeps share a contact */
+    int32_t* own_at;                    /* (contacts) offset of the first number of each contact in own */
+    lavender_four* push;                /* (rows, 4) required shift, multiplier and step of the position projection */
     double *d, *inverse;                /* (contacts + 1, 2) 1/kg; (bodies + 1, 12) inverse inertia */
-    void* place[9];                     /* allocated memory, and its sizes in bytes */
-    size_t size[9];
+    void* place[11];                     /* allocated memory, and its sizes in bytes */
+    size_t size[11];
 } lavender_manifolds;
 
-enum { LAVENDER_SWEEP, LAVENDER_ROWS, LAVENDER_REFRESH, LAVENDER_FOLLOW };
+enum {
+    LAVENDER_SWEEP, LAVENDER_ROWS, LAVENDER_REFRESH, LAVENDER_FOLLOW, LAVENDER_CHECK, LAVENDER_AIM, LAVENDER_PROJECT, LAVENDER_MISS
+};
 #define LAVENDER_HAS_POINT(g, k) \
     (lavender_four_bits) { -(g->count[0] > k), -(g->count[1] > k), -(g->count[2] > k), -(g->count[3] > k) }
 
@@ -83,7 +91,7 @@ static void* lavender_reserve(lavender_manifolds* m, int k, size_t size) {
 }
 
 static void lavender_free_manifolds(lavender_manifolds* m) {
-    for (int k = 0; k < 9; k++) free(m->place[k]);
+    for (int k = 0; k < 11; k++) free(m->place[k]);
     memset(m, 0, sizeof *m);
 }
 
@@ -152,7 +160,7 @@ static int lavender_has_avx2(void) { return 0; }
 
 /* Write manifold `first` .. `first` + `count` of the order to a lane of a group, without its rows. */
 static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_t count, lavender_group* g, lavender_four* own,
-                               int lane) {
+                               int32_t* own_at, int lane) {
     const int32_t i = c->order[first], *body = c->body + 2 * i;
     const double *n = c->normal + 3 * i, *t = c->tangent + 3 * i;
     double* axis = (double*)g->axis + lane;
@@ -185,6 +193,7 @@ static void lavender_fill_lane(const lavender_contacts* c, int32_t first, int32_
             p[4 * (3 + q)] = c->arm_b[3 * at + q];
         }
         if (!own) continue;
+        own_at[at] = 32 * (g->first_row + j) + lane;
         p = (double*)(own + 8 * j) + lane;
         for (int q = 0; q < 3; q++) p[4 * q] = c->impulse[3 * at + q];
         p[4 * 3] = c->gap[at];
@@ -322,13 +331,15 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     m->start = (size_t*)lavender_reserve(m, 2, sizeof(size_t) * every);
     m->groups = (char*)lavender_reserve(m, 3, most * every);
     m->own = NULL;
-    const int has_own = m->n_sweeps == 1 && m->along;
+    const int has_own = m->n_sweeps == 1;
     m->x = (double*)lavender_reserve(m, 4, has_own ? 4 * every * 8 * sizeof(lavender_four) : 8 * 8 * (n + 1));
     m->v = (double*)lavender_reserve(m, 5, 3 * 8 * 8 * (n_bodies + 2));
     m->d = (double*)lavender_reserve(m, 6, 8 * 2 * (n + 1));
     m->inverse = (double*)lavender_reserve(m, 7, 8 * 12 * (n_bodies + 1));
     m->rows = (lavender_rows*)lavender_reserve(m, 8, 4 * every * sizeof(lavender_rows));
-    if (!(m->start && m->groups && m->x && m->v && m->d && m->inverse && m->rows)) return 0;
+    m->push = (lavender_four*)lavender_reserve(m, 9, 16 * (size_t)m->n_once * sizeof(lavender_four));
+    m->own_at = (int32_t*)lavender_reserve(m, 10, 4 * (n + 1));
+    if (!(m->start && m->groups && m->x && m->v && m->d && m->inverse && m->rows && m->push && m->own_at)) return 0;
     m->start_once = m->n_sweeps > 1 ? m->start + m->n_groups : m->start;
     m->free = m->v + 8 * (n_bodies + 2);
     m->before = m->free + 8 * (n_bodies + 2);
@@ -358,13 +369,13 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
         const int32_t stop = m->n_sweeps == 1 ? used[k] : (i + 4 < count ? i + 4 : count);
         for (int lane = 0; i < stop; lane++, i++) {
             const int32_t at = m->n_sweeps == 1 ? sorted[i] : i;
-            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, own, lane);
+            lavender_fill_lane(c, first[at], first[at + 1] - first[at], g, own, m->own_at, lane);
         }
         m->start_once[k] = bytes;
         bytes += lavender_close_group(c, g, m->rows + row, own);
         row += g->n;
     }
-    lavender_run_groups(wide, m, LAVENDER_ROWS, 0, NULL, NULL, NULL);
+    lavender_run_groups(wide, m, LAVENDER_ROWS, 0, NULL);
     /* groups of several sweeps */
     for (int32_t k = 0, i = 0; k < m->n_groups && m->n_sweeps > 1; k++) {
         lavender_group* g = lavender_open_group(c, m->groups + bytes, row);
@@ -389,6 +400,9 @@ static int lavender_pack_manifolds(const lavender_contacts* c, int wide, int32_t
     return 1;
 }
 
+/* Return whether groups in their order, or backwards, visit the contacts as numbered. */
+static int lavender_sweep_along(const lavender_manifolds* m) { return m->along && m->n_sweeps == 1; }
+
 static void lavender_load_velocities(int32_t n, const double* from, double* to) {
     for (size_t i = 0; i < (size_t)n; i++)
         for (int k = 0; k < 6; k++) to[8 * i + (size_t)k] = from[6 * i + (size_t)k];
@@ -401,21 +415,24 @@ static void lavender_store_velocities(int32_t n, const double* from, double* to)
 
 /* Compute the right-hand sides for the velocities `free` (n_bodies, 6) and those before the substep of all bodies, `before`, and
  * the velocities M^-1 J^T lam of the warm start: `compute_velocity_change` of core/velocity.pxd. */
-static void lavender_refresh_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, const lavender_targets* t,
+static void lavender_refresh_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, lavender_targets* t,
                                        const double* free, const double* before, const int32_t* body_of) {
-    const int in_lanes = m->along && m->n_sweeps == 1;
+    const int in_lanes = lavender_sweep_along(m);
     double *v = m->v, l[3];
     lavender_load_velocities(c->n_bodies, free, m->free);
     for (int32_t i = 0; c->restitution && i < c->n_bodies; i++)
         for (int k = 0; k < 6; k++) m->before[8 * i + k] = before[6 * body_of[i] + k];
     memset(v, 0, 64 * (size_t)(c->n_bodies + 2));
-    lavender_run_groups(wide, m, LAVENDER_REFRESH, m->along < 0, t, c->restitution ? m->before : NULL,
-                        t->warm && in_lanes ? v : NULL);
+    t->before = c->restitution ? m->before : NULL;
+    t->wrench = t->warm && in_lanes ? v : NULL;
+    lavender_run_groups(wide, m, LAVENDER_REFRESH, m->along < 0, t);
     for (int32_t i = 0; i < c->n && t->warm && !in_lanes; i++) {
-        const double *n = c->normal + 3 * i, *s = c->tangent + 3 * i, *x = m->x + 8 * (size_t)i;
+        const double *n = c->normal + 3 * i, *s = c->tangent + 3 * i;
+        const double* x = m->own ? (const double*)m->own + m->own_at[i] : m->x + 8 * (size_t)i;
+        const size_t next = m->own ? 4 : 1;
         const double u[3] = {n[1] * s[2] - n[2] * s[1], n[2] * s[0] - n[0] * s[2], n[0] * s[1] - n[1] * s[0]};
         double f[3];
-        for (int k = 0; k < 3; k++) f[k] = (x[0] * n[k] + x[1] * s[k]) + x[2] * u[k];
+        for (int k = 0; k < 3; k++) f[k] = (x[0] * n[k] + x[next] * s[k]) + x[2 * next] * u[k];
         for (int side = 0; side < 2; side++) {
             const int32_t body = c->body[2 * i + side];
             const double* r = (side ? c->arm_b : c->arm_a) + 3 * i;
@@ -440,40 +457,44 @@ static void lavender_refresh_manifolds(const lavender_contacts* c, lavender_mani
 }
 
 static void lavender_sweep_manifolds(lavender_manifolds* m, int wide, int32_t sweeps, int backwards) {
-    for (int32_t s = 0; s < sweeps; s += m->n_sweeps) lavender_run_groups(wide, m, LAVENDER_SWEEP, backwards, NULL, NULL, NULL);
+    for (int32_t s = 0; s < sweeps; s += m->n_sweeps) lavender_run_groups(wide, m, LAVENDER_SWEEP, backwards, NULL);
 }
 
 /* Let the gaps follow the displacement s (n_bodies, 6) of the bodies. */
 static void lavender_follow_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, const double* s) {
     lavender_load_velocities(c->n_bodies, s, m->free);
-    lavender_run_groups(wide, m, LAVENDER_FOLLOW, 0, NULL, NULL, NULL);
+    lavender_run_groups(wide, m, LAVENDER_FOLLOW, 0, NULL);
 }
 
-/* Return the largest -gap [m], at least 0; finite: whether all gaps and impulses are finite. */
-static double lavender_check_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int* finite) {
-    double depth = 0.0, bad[4] = {0.0, 0.0, 0.0, 0.0};
-    for (int32_t k = 0; k < m->n_once && m->own; k++) {
-        const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[k]);
-        for (int j = 0; j < g->n; j++)
-            for (int lane = 0; lane < 4; lane++) {
-                const double* p = (const double*)(m->own + 8 * ((size_t)g->first_row + (size_t)j)) + lane;
-                if (j >= g->count[lane]) continue;
-                for (int q = 0; q < 4; q++) bad[q] += 0.0 * p[4 * q];
-                if (-p[4 * 3] > depth) depth = -p[4 * 3];
-            }
-    }
-    for (size_t i = 0; i < (size_t)c->n && !m->own; i++) {
-        const double* x = m->x + 8 * i;
-        for (int k = 0; k < 4; k++) bad[k] += 0.0 * x[k];
-        if (-x[3] > depth) depth = -x[3];
-    }
-    *finite = (bad[0] + bad[1]) + (bad[2] + bad[3]) == 0.0;
-    return depth;
+/* Find the largest -gap, t->most, and whether all gaps and impulses are finite. */
+static void lavender_check_manifolds(const lavender_manifolds* m, int wide, lavender_targets* t) {
+    lavender_run_groups(wide, m, LAVENDER_CHECK, 0, t);
 }
 
-/* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them, and the targets of rows
- * from first_target on. */
-static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows, int32_t first_target) {
+/* Compute the shift (n_bodies, 6) of the position projection for the velocities v_free + dv by `least` sweeps, or without slop by
+ * up to `most`, over the contacts as numbered or from the last to the first. Return the number of sweeps; 0: there is no shift. */
+static int32_t lavender_project_manifolds(const lavender_contacts* c, lavender_manifolds* m, int wide, lavender_targets* t,
+                                          int32_t least, int32_t most, int last_first, const double* v_free, const double* dv,
+                                          double* shift) {
+    int32_t sweep = 0;
+    lavender_load_velocities(c->n_bodies, v_free, m->free);
+    for (size_t i = 0; i < (size_t)c->n_bodies; i++)
+        for (size_t k = 0; k < 6; k++) m->free[8 * i + k] += dv[6 * i + k];
+    lavender_run_groups(wide, m, LAVENDER_AIM, 0, t);
+    if (!t->due) return 0;
+    const double before = t->most;
+    memset(m->v, 0, 64 * (size_t)(c->n_bodies + 2));
+    do {
+        if (sweep == most) return 0;
+        lavender_run_groups(wide, m, LAVENDER_PROJECT, (m->along < 0) != last_first, t);
+        if (++sweep >= least && t->slop == 0.0) lavender_run_groups(wide, m, LAVENDER_MISS, 0, t);
+    } while (sweep < least || (t->slop == 0.0 && !(t->most <= before)));
+    lavender_store_velocities(c->n_bodies, m->v, shift);
+    return sweep;
+}
+
+/* Write impulses and gaps back; with `rows` also right-hand sides and rows, as single contacts have them. */
+static void lavender_store_manifolds(const lavender_contacts* c, const lavender_manifolds* m, int rows) {
     for (int32_t k = 0; k < m->n_once; k++) {
         const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[k]);
         for (int lane = 0; lane < 4; lane++)
@@ -486,7 +507,7 @@ static void lavender_store_manifolds(const lavender_contacts* c, const lavender_
                 if (!rows) continue;
                 for (size_t q = 0; q < 3; q++) {
                     c->b[3 * i + q] = 0.0 - x[next * (4 + q)];
-                    if (3 * i + q >= (size_t)first_target) c->target[3 * i + q] = q ? 0.0 : x[next * 7];
+                    c->target[3 * i + q] = q ? 0.0 : x[next * 7];
                     c->d[3 * i + q] = m->d[2 * i + (q > 0)];
                 }
                 c->step[3 * i] = p[4 * 0];
@@ -508,8 +529,10 @@ typedef struct {
 #define lavender_refresh_manifolds(c, m, wide, t, free, before, body_of) ((void)(c), (void)(t))
 #define lavender_sweep_manifolds(m, wide, sweeps, backwards) ((void)(wide), (void)(sweeps), (void)(backwards))
 #define lavender_follow_manifolds(c, m, wide, s) ((void)(c))
-#define lavender_check_manifolds(c, m, finite) ((void)(c), *(finite) = 1, 0.0)
-#define lavender_store_manifolds(c, m, rows, first_target) ((void)(c), (void)(rows), (void)(first_target))
+#define lavender_check_manifolds(m, wide, t) ((void)(wide), (void)(t))
+#define lavender_sweep_along(m) 0
+#define lavender_project_manifolds(c, m, wide, t, least, most, last_first, v_free, dv, shift) ((void)(last_first), 0)
+#define lavender_store_manifolds(c, m, rows) ((void)(c), (void)(rows))
 #define lavender_store_velocities(n, from, to) ((void)(n))
 #endif
 #endif

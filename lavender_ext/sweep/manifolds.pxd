@@ -38,7 +38,10 @@ cdef extern from "lavender_ext/sweep/manifolds.h":
         double beta
         double slop
         double bounce
+        double max_push
         int warm
+        double most
+        int finite
     ctypedef struct manifolds_t "lavender_manifolds":
         int32_t n_groups
         double* v
@@ -47,13 +50,16 @@ cdef extern from "lavender_ext/sweep/manifolds.h":
     void free_manifolds "lavender_free_manifolds"(manifolds_t* m) noexcept nogil
     int pack_manifolds "lavender_pack_manifolds"(const contacts_t* c, int wide, int32_t n_sweeps, double least,
                                                  manifolds_t* m) noexcept nogil
-    void refresh_manifolds "lavender_refresh_manifolds"(const contacts_t* c, manifolds_t* m, int wide, const targets_t* t,
+    void refresh_manifolds "lavender_refresh_manifolds"(const contacts_t* c, manifolds_t* m, int wide, targets_t* t,
                                                         const double* free, const double* before,
                                                         const int32_t* body_of) noexcept nogil
     void sweep_manifolds "lavender_sweep_manifolds"(manifolds_t* m, int wide, int32_t sweeps, int backwards) noexcept nogil
     void follow_manifolds "lavender_follow_manifolds"(const contacts_t* c, manifolds_t* m, int wide,
                                                       const double* s) noexcept nogil
-    double check_manifolds "lavender_check_manifolds"(const contacts_t* c, const manifolds_t* m, int* finite) noexcept nogil
-    void store_manifolds "lavender_store_manifolds"(const contacts_t* c, const manifolds_t* m, int rows,
-                                                    int32_t first_target) noexcept nogil
+    void check_manifolds "lavender_check_manifolds"(const manifolds_t* m, int wide, targets_t* t) noexcept nogil
+    int sweep_along "lavender_sweep_along"(const manifolds_t* m) noexcept nogil
+    int32_t project_manifolds "lavender_project_manifolds"(const contacts_t* c, manifolds_t* m, int wide, targets_t* t,
+                                                           int32_t least, int32_t most, int last_first, const double* v_free,
+                                                           const double* dv, double* shift) noexcept nogil
+    void store_manifolds "lavender_store_manifolds"(const contacts_t* c, const manifolds_t* m, int rows) noexcept nogil
     void store_velocities "lavender_store_velocities"(int32_t n, const double* from_, double* to) noexcept nogil

@@ -40,6 +40,13 @@ ISA LAVENDER_INLINE_FOUR void FOUR(cross)(const lavender_four* a, const lavender
     out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
+/* Inverse inertias (9, and 3 numbers that nothing reads) of one body of each lane; at: offsets of velocities. */
+ISA LAVENDER_INLINE_FOUR void FOUR(load_inertias)(const double* inverse, const int32_t* at, lavender_four* out) {
+    const double *a = inverse + 3 * (at[0] / 2), *b = inverse + 3 * (at[1] / 2), *c = inverse + 3 * (at[2] / 2);
+    const double* d = inverse + 3 * (at[3] / 2);
+    for (int k = 0; k < 12; k += 4) LOAD_FOUR(a + k, b + k, c + k, d + k, out + k);
+}
+
 /* Diagonal d (2 of each contact), steps, couplings and I^-1 (arm x axis) of all points: `compute_contact_delassus_block` of
  * core/rows.pxd and `finish_pair` of core/steps.pxd for two tangents in a disk. inverse (bodies + 1, 12): inverse inertia. */
 ISA static void FOUR(rows)(const lavender_group* g, lavender_rows* rows, const double* inverse, double* d) {
@@ -50,12 +57,8 @@ ISA static void FOUR(rows)(const lavender_group* g, lavender_rows* rows, const d
     const lavender_four d_2 = mass * LAVENDER_DOT_FOUR(axis + 6, axis + 6), c_1 = mass * LAVENDER_DOT_FOUR(axis + 3, axis);
     const lavender_four c_2 = mass * LAVENDER_DOT_FOUR(axis + 6, axis), off_12 = mass * LAVENDER_DOT_FOUR(axis + 3, axis + 6);
     lavender_four inv[2][12];
-    for (int side = 0; side < 2; side++) {
-        const int32_t* at = side ? g->read_b : g->read_a;
-        const double *a = inverse + 3 * (at[0] / 2), *b = inverse + 3 * (at[1] / 2), *c = inverse + 3 * (at[2] / 2);
-        const double* e = inverse + 3 * (at[3] / 2);
-        for (int k = 0; k < 12; k += 4) LOAD_FOUR(a + k, b + k, c + k, e + k, inv[side] + k);
-    }
+    FOUR(load_inertias)(inverse, g->read_a, inv[0]);
+    FOUR(load_inertias)(inverse, g->read_b, inv[1]);
     for (int j = 0; j < g->n; j++) {
         const lavender_point* p = g->point + j;
         lavender_rows* out = rows + j;
@@ -104,6 +107,95 @@ ISA static void FOUR(follow)(const lavender_group* g, const double* shift, doubl
             continue;
         }
         for (int lane = 0; lane < 4; lane++) x[at[lane] + 3] += closing[lane];
+    }
+}
+
+/* Largest -gap of the points, at least `depth`; bad: not 0 if a gap or impulse is not finite. */
+ISA static void FOUR(check)(const lavender_group* g, const double* x, const lavender_four* own, lavender_four* depth,
+                            lavender_four* bad) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
+    for (int j = 0; j < g->n; j++) {
+        const int32_t* at = g->contact[j];
+        lavender_four lam[4];
+        if (own) for (int k = 0; k < 4; k++) lam[k] = own[8 * j + k];
+        else LOAD_FOUR(x + at[0], x + at[1], x + at[2], x + at[3], lam);
+        if (j >= g->n_all) lam[3] = LAVENDER_PICK_FOUR(LAVENDER_HAS_POINT(g, j), lam[3], zero);
+        for (int k = 0; k < 4; k++) *bad = *bad + zero * lam[k];
+        *depth = LAVENDER_PICK_FOUR(-lam[3] > *depth, -lam[3], *depth);
+    }
+}
+
+/* Write the shift that each point requires for the velocities v by (1) of engine/projection.pxd, its multiplier 0, and its step,
+ * 0 where a lane has no point, to `push`. most: largest required shift; due: whether one is positive. */
+ISA static void FOUR(aim)(const lavender_group* g, const lavender_rows* rows, const lavender_targets* t, const double* v,
+                          const double* x, const lavender_four* own, lavender_four* push, lavender_four* most,
+                          lavender_four_bits* due) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0}, h = zero + t->h, limit = zero + t->max_push;
+    lavender_four va[6], vb[6], u[3];
+    FOUR(load_bodies)(v, g->read_a, va);
+    FOUR(load_bodies)(v, g->read_b, vb);
+    for (int j = 0; j < g->n; j++) {
+        const int32_t* at = g->contact[j];
+        const lavender_four gap = own ? own[8 * j + 3]
+                                      : (lavender_four){x[at[0] + 3], x[at[1] + 3], x[at[2] + 3], x[at[3] + 3]};
+        FOUR(relative_velocity)(g->point + j, va, vb, u);
+        lavender_four goal = -t->beta * (gap + h * LAVENDER_DOT_FOUR(g->axis, u) + t->slop);
+        const lavender_four_bits has = LAVENDER_HAS_POINT(g, j);
+        goal = LAVENDER_PICK_FOUR(has, goal, zero);
+        *due = *due | (goal > zero);
+        goal = LAVENDER_PICK_FOUR(goal < limit, goal, limit);
+        *most = LAVENDER_PICK_FOUR(goal > *most, goal, *most);
+        push[4 * j] = goal;
+        push[4 * j + 1] = zero;
+        push[4 * j + 2] = LAVENDER_PICK_FOUR(has, rows[j].step[0], zero);
+    }
+}
+
+/* Update the multipliers and the shift s of the bodies: a sweep of `project_positions` in engine/projection.pxd. */
+ISA static void FOUR(project)(const lavender_group* g, int backwards, const double* inverse, lavender_four* push, double* s) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
+    lavender_four sa[6], sb[6], inv_a[12], inv_b[12], u[3], impulse[3], l[3];
+    FOUR(load_bodies)(s, g->read_a, sa);
+    FOUR(load_bodies)(s, g->read_b, sb);
+    FOUR(load_inertias)(inverse, g->read_a, inv_a);
+    FOUR(load_inertias)(inverse, g->read_b, inv_b);
+    for (int j = 0; j < g->n; j++) {
+        const int k = backwards ? g->n - 1 - j : j;
+        const lavender_point* p = g->point + k;
+        lavender_four* at = push + 4 * k;
+        FOUR(relative_velocity)(p, sa, sb, u);
+        lavender_four multiplier = at[1] - (LAVENDER_DOT_FOUR(g->axis, u) - at[0]) * at[2];
+        multiplier = LAVENDER_PICK_FOUR(multiplier < zero, zero, multiplier);
+        const lavender_four change = multiplier - at[1];
+        if (!ANY(change != zero)) continue;
+        at[1] = multiplier;
+        for (int i = 0; i < 3; i++) impulse[i] = change * g->axis[i];
+        FOUR(cross)(p->arm_a, impulse, l);
+        for (int i = 0; i < 3; i++) {
+            sa[i] = sa[i] - g->inv_mass_a * impulse[i];
+            sa[3 + i] = sa[3 + i] - LAVENDER_DOT_FOUR(inv_a + 3 * i, l);
+        }
+        FOUR(cross)(p->arm_b, impulse, l);
+        for (int i = 0; i < 3; i++) {
+            sb[i] = sb[i] + g->inv_mass_b * impulse[i];
+            sb[3 + i] = sb[3 + i] + LAVENDER_DOT_FOUR(inv_b + 3 * i, l);
+        }
+    }
+    FOUR(store_bodies)(s, g->write_a, sa);
+    FOUR(store_bodies)(s, g->write_b, sb);
+}
+
+/* Largest part of a required shift that s does not make, at least `most`. */
+ISA static void FOUR(miss)(const lavender_group* g, const lavender_four* push, const double* s, lavender_four* most) {
+    const lavender_four zero = {0.0, 0.0, 0.0, 0.0};
+    lavender_four sa[6], sb[6], u[3];
+    FOUR(load_bodies)(s, g->read_a, sa);
+    FOUR(load_bodies)(s, g->read_b, sb);
+    for (int j = 0; j < g->n; j++) {
+        FOUR(relative_velocity)(g->point + j, sa, sb, u);
+        lavender_four rest = push[4 * j] - LAVENDER_DOT_FOUR(g->axis, u);
+        if (j >= g->n_all) rest = LAVENDER_PICK_FOUR(LAVENDER_HAS_POINT(g, j), rest, zero);
+        *most = LAVENDER_PICK_FOUR(rest > *most, rest, *most);
     }
 }
 
@@ -285,9 +377,10 @@ ISA static __attribute__((noinline)) void FOUR(sweep_own)(const lavender_manifol
     }
 }
 
-/* One pass; `t` and `before` are for LAVENDER_REFRESH, and `f` receives the wrenches. */
-ISA static void FOUR(run)(const lavender_manifolds* m, int what, int backwards, const lavender_targets* t, const double* before,
-                          double* f) {
+/* One pass, with the numbers and arrays of `t` that it needs. */
+ISA static void FOUR(run)(const lavender_manifolds* m, int what, int backwards, lavender_targets* t) {
+    lavender_four most = {0.0, 0.0, 0.0, 0.0}, bad = most;
+    lavender_four_bits due = (lavender_four_bits)most;
     if (what == LAVENDER_SWEEP) {
         if (m->own) FOUR(sweep_own)(m, backwards);
         else FOUR(sweep)(m, backwards);
@@ -295,11 +388,23 @@ ISA static void FOUR(run)(const lavender_manifolds* m, int what, int backwards, 
     }
     for (int i = 0; i < m->n_once; i++) {
         const lavender_group* g = (const lavender_group*)(m->groups + m->start_once[backwards ? m->n_once - 1 - i : i]);
-        lavender_four* own = m->own ? m->own + 8 * (size_t)g->first_row : NULL;
-        if (what == LAVENDER_ROWS) FOUR(rows)(g, m->rows + g->first_row, m->inverse, m->d);
-        else if (what == LAVENDER_REFRESH) FOUR(refresh)(g, t, backwards, m->free, before, m->x, own, f);
-        else FOUR(follow)(g, m->free, m->x, own);
+        const size_t row = (size_t)g->first_row;
+        lavender_rows* rows = m->rows + row;
+        lavender_four *own = m->own ? m->own + 8 * row : NULL, *push = m->push + 4 * row;
+        if (what == LAVENDER_ROWS) FOUR(rows)(g, rows, m->inverse, m->d);
+        else if (what == LAVENDER_REFRESH) FOUR(refresh)(g, t, backwards, m->free, t->before, m->x, own, t->wrench);
+        else if (what == LAVENDER_FOLLOW) FOUR(follow)(g, m->free, m->x, own);
+        else if (what == LAVENDER_CHECK) FOUR(check)(g, m->x, own, &most, &bad);
+        else if (what == LAVENDER_AIM) FOUR(aim)(g, rows, t, m->free, m->x, own, push, &most, &due);
+        else if (what == LAVENDER_PROJECT) FOUR(project)(g, backwards, m->inverse, push, m->v);
+        else FOUR(miss)(g, push, m->v, &most);
     }
+    if (!t) return;
+    t->most = 0.0;
+    for (int lane = 0; lane < 4; lane++)
+        if (most[lane] > t->most) t->most = most[lane];
+    t->finite = (bad[0] + bad[1]) + (bad[2] + bad[3]) == 0.0;
+    t->due = ANY(due);
 }
 
 #undef FOUR

@@ -34,4 +34,5 @@ ORDER_NUMBER = {
     "top_down": arrays.TOP_DOWN,
     "colored": arrays.COLORED,
     "alternating": arrays.ALTERNATING,
+    "colored_pairs": arrays.COLORED_PAIRS,
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lavender import io
-from lavender.base.arrays import check_int, mark_read_only
+from lavender.base.arrays import IntArray, check_int, mark_read_only
 from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.io.stored import prepare_step_folder
 from lavender.problem import Problem
@@ -76,16 +76,35 @@ class Simulation(Stepping):
         contacts whose bodies hardly move, and differ from it in velocities, gaps and impulses.
 
         `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n = `solver_iterations` returns the
-        impulses of that substep bit for bit. Pass the scene's `order` to it, unless the order is `alternating`: the
-        contacts of the problem are then already in the order of the sweep. The observation of a step contains the
-        impulses of its last substep.
+        impulses of that substep bit for bit, with `order=sweep_order()` if the scene names an order. The observation
+        of a step contains the impulses of its last substep.
         """
+        return self._build_problem(self._prepare_next_substep())
+
+    @run_exclusively
+    def sweep_order(self) -> str | IntArray:
+        """Return the `order` with which `lavender.solve` sweeps `constraint_problem()` as the next substep does.
+
+        Returns
+        -------
+        str or (k,) int
+            The scene's order. Under `alternating`, the problem lists the contacts as they are swept, and the order is
+            "given"; under `colored_pairs`, the order is a permutation of blocks.
+        """
+        order = self._parameters.order
+        if order != "colored_pairs":
+            return "given" if order == "alternating" else order
+        blocks: IntArray = self._prepare_next_substep().kernel.compute_sweep_order()
+        return blocks
+
+    def _prepare_next_substep(self) -> State:
+        """Return a copy of the state with the problem of the next substep."""
         state = self.state.copy()
         if self._restored:
             invalidate_pair_list(state)
         while state.kernel.prepare_substep() == NEED_CAPACITY:
             state = state.with_larger_buffers()
-        return self._build_problem(state)
+        return state
 
     def sweep_seed(self) -> int:
         """Return the `seed` with which `lavender.solve(..., order="random")` uses the order of the next substep."""

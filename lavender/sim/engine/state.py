@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from lavender_ext.engine.arrays import (
 )
 from lavender_ext.engine.newton_substep import Substep
 
-Copy = Callable[[], np.ndarray]
+CONTACT_ARRAYS = ("contact_pair", "point", "normal", "tangent")
 
 assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 
@@ -44,22 +44,6 @@ MAX_PUSH = 0.2  # [m] A substep corrects at most this much of a position error.
 # would stop its motion.
 JOINT_GIVE = 1e-5
 MAX_BUFFER_BYTES = 2**32  # [bytes] Larger buffers (the three together) are rejected.
-
-
-class ObservationViews(NamedTuple):
-    """Functions that copy the arrays of an observation, for given numbers of contacts and of contact rows."""
-
-    arrays: dict[
-        str, Copy
-    ]  # mapping of str to callable: copies of the arrays of an observation, by name.
-    contacts: dict[
-        str, Copy
-    ]  # mapping of str to callable: copies of the arrays of its contacts, by name.
-    gap: np.ndarray  # (c,) m
-    impulses: (
-        Copy | None
-    )  # Copy of the contact impulses; None if contacts have different numbers of rows.
-    per: int  # Largest number of rows of a contact of this scene.
 
 
 class State:
@@ -83,41 +67,38 @@ class State:
         self.kernel = substep.Buffers(self.size, self.real, self.index, self.keys)
         self.a: dict[str, Any] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
-        self._views: tuple[int, int, ObservationViews] | None = None
+        self._views: tuple[int, int, tuple[Any, ...]] = -1, -1, ()
 
     @cached_property
     def warm_start_phase(self) -> Substep:
         """The compiled first phase of the solver `newton`, bound to these buffers."""
         return Substep(self.size, self.real, self.index, self.keys, False)
 
-    def get_observation_views(self, contacts: int, rows: int) -> ObservationViews:
-        """Return the copy functions of an observation; they are cached while the numbers do not change."""
-        if self._views is None or self._views[:2] != (contacts, rows):
+    def get_observation_views(self, contacts: int, rows: int) -> tuple[Any, ...]:
+        """Return what an observation copies; it is cached while the numbers of contacts and contact rows do not change.
+
+        Functions that copy positions, quaternions, velocities, joint impulses, the eight solver values, and pair,
+        point, normal, tangent of the contacts; their gaps (c,) [m]; a function that copies the contact impulses, or
+        None if contacts have different numbers of rows.
+        """
+        if self._views[0] != contacts or self._views[1] != rows:
             a = self.a
             first = int(self.size[SIZE["joint_rows"]])
             per = int(self.size[SIZE["rows_per_contact"]])
             even = rows == contacts * per
-            block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
-            out = self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues)
-            array_of = {"positions": "x", "quaternions": "q", "velocities": "v"}
-            array_of["joint_impulses"] = "joint_impulse"
-            each = {
-                "pair": "contact_pair",
-                "point": "point",
-                "normal": "normal",
-                "tangent": "tangent",
-            }
-            views = ObservationViews(
-                arrays={
-                    **{name: a[array].copy for name, array in array_of.items()},
-                    "solver": out.copy,
-                },
-                contacts={name: a[array][:contacts].copy for name, array in each.items()},
-                gap=a["gap"][:contacts],
-                impulses=block,
-                per=per,
+            self._views = (
+                contacts,
+                rows,
+                (
+                    *(a[name].copy for name in ("x", "q", "v", "joint_impulse")),
+                    self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues).copy,
+                    *(a[name][:contacts].copy for name in CONTACT_ARRAYS),
+                    a["gap"][:contacts],
+                    a["impulse"][first : first + rows].reshape(contacts, per).copy
+                    if even
+                    else None,
+                ),
             )
-            self._views = contacts, rows, views
         return self._views[2]
 
     @property

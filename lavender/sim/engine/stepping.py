@@ -31,6 +31,7 @@ from lavender_ext.engine.arrays import NEED_CAPACITY, OK
 
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # Default tolerance of lavender.solve.
+ZERO = np.zeros(())  # An array is subtracted from faster than a float.
 INSIDE_STEP = (
     "this simulation is inside a step; a solver or callback may not use it until the step has ended"
 )
@@ -105,6 +106,8 @@ class Stepping:
         ):
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
         self._order = get_sweep_order(p)
+        # Whole steps of a compiled call.
+        self._steps_per_call = max(1, SUBSTEPS_PER_CALL // p.substeps)
         self._steps = 0
         self._failed = 0
         self._end_reason = ""  # Reason why no step can follow, or empty.
@@ -314,13 +317,13 @@ class Stepping:
                 raise LavenderError(self._refusal)
             self._check_can_step()
             self._refusal = INSIDE_STEP
-            per_call = max(
-                1, SUBSTEPS_PER_CALL // self._parameters.substeps
-            )  # Whole steps of a compiled call.
+            if self._restored:
+                invalidate_pair_list(self.state)
+                self._restored = False
             lost = ""
             try:
                 while n > 0 and not lost:
-                    steps = min(n, per_call) if self._own_sweeps else 1
+                    steps = min(n, self._steps_per_call) if self._own_sweeps else 1
                     if self._own_sweeps:
                         self._advance_by_sweeps(steps)
                     else:
@@ -335,15 +338,8 @@ class Stepping:
         if self._end_reason:
             raise LavenderError(f"{self._end_reason}; reset() or restore a snapshot")
 
-    def _validate_pair_list(self) -> None:
-        """Build the list of pairs again in the next substep if the state comes from a snapshot."""
-        if self._restored:
-            invalidate_pair_list(self.state)
-            self._restored = False
-
     def _advance_by_sweeps(self, steps: int) -> None:
         """Do steps by the compiled sweeps, and count those that are complete if an error ends them."""
-        self._validate_pair_list()
         substeps = self._parameters.substeps
         first_substep = self.state.head.item(HEAD["step"])
         left = steps * substeps
@@ -356,9 +352,13 @@ class Stepping:
                 elif status != OK:
                     break
         finally:
-            done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
-            complete, rest = divmod(done, substeps)
-            self._steps += complete
+            rest = 0
+            if left == 0:
+                self._steps += steps
+            else:
+                done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
+                complete, rest = divmod(done, substeps)
+                self._steps += complete
             if rest and self.state.head.item(HEAD["lost"]) >= 0:
                 self._steps += 1  # The step in which the state was lost counts.
             elif rest:
@@ -366,7 +366,6 @@ class Stepping:
 
     def _advance_by_solver(self) -> None:
         """Do a step by the registered solver; restore the state before the step if a substep raises."""
-        self._validate_pair_list()
         substeps = self._parameters.substeps
         first = self.state
         first_substep = first.head.item(HEAD["step"])
@@ -488,30 +487,43 @@ class Stepping:
         """Return the observation of the present state, in new arrays."""
         s = self.state
         c = s.head.item(HEAD["contacts"])
-        views = s.get_observation_views(c, s.head.item(HEAD["contact_rows"]))
-        observation: dict[str, Any] = {
-            name: copy_array() for name, copy_array in views.arrays.items()
+        x, q, v, joints, out, pair, point, normal, tangent, gap, impulses = s.get_observation_views(
+            c, s.head.item(HEAD["contact_rows"])
+        )
+        contacts: dict[str, Any] = {
+            "pair": pair(),
+            "point": point(),
+            "normal": normal(),
+            "tangent": tangent(),
+            "depth": ZERO - gap,
         }
-        contacts = {name: copy_array() for name, copy_array in views.contacts.items()}
-        contacts["depth"] = 0.0 - views.gap
-        observation["contacts"] = contacts
-        if views.impulses is not None:
-            contacts["impulses"] = views.impulses()
-            return observation
-        # Contacts have different numbers of rows; missing rows are zero.
+        contacts["impulses"] = impulses() if impulses else self._collect_uneven_impulses(c)
+        return {
+            "positions": x(),
+            "quaternions": q(),
+            "velocities": v(),
+            "joint_impulses": joints(),
+            "solver": out(),
+            "contacts": contacts,
+        }
+
+    def _collect_uneven_impulses(self, c: int) -> FloatArray:
+        """Return the impulses (c, r) [N s, N m s] of contacts with different numbers of rows; missing rows are zero."""
+        s = self.state
         a = s.a
         kj = int(s.size[SIZE["joints"]])
-        contacts["impulses"] = out = np.zeros((c, views.per))
+        per = int(s.size[SIZE["rows_per_contact"]])
+        out = np.zeros((c, per))
         first = a["ptr"][kj : kj + c]
         end = a["ptr"][kj + 1 : kj + c + 1]
-        for row in range(views.per):
+        for row in range(per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
-        if views.per == 6:
+        if per == 6:
             # The rolling rows are the last two rows of a contact, with or without a torsion row before them.
             no_torsion = end - first == 5
             out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
-        return observation
+        return out
 
     def _make_step_info(self, lost: str = "") -> dict[str, Any]:
         """Return the `info` of a step."""
@@ -523,7 +535,7 @@ class Stepping:
         }
         if lost:
             info["lost_body"] = lost
-        elif self.state.head.item(HEAD["solved"]):
+        elif (self.report_residual or self.report_motion) and self.state.head.item(HEAD["solved"]):
             if self.report_residual:
                 info["residual"] = self._summarise_residual()
             if self.report_motion:

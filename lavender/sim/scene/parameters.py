@@ -22,8 +22,8 @@ from lavender.problem.ordering import ENGINE_ORDERS
 from lavender.sim.scene.parts import check_numbers
 from lavender.solvers.registry import get
 
-# "alternating" reverses the order of contacts in every substep.
-SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")
+# "alternating" and "colored_pairs" reverse the order of contacts in every other substep.
+SCENE_ORDERS = (*ENGINE_ORDERS, "alternating", "colored_pairs")
 ON_FAILURE = ("use", "keep", "damp", "raise")
 #: Ranges of the numeric parameters.
 PARAMETER_RANGES: dict[str, dict[str, float]] = {

@@ -67,13 +67,10 @@ ROWS_OF_CONTACTS = (
 def test_step_has_the_bits_and_residuals_of_solve(name, more):
     sim = lv.Simulation(lv.Scene(name, substeps=1, **SCENES.get(name, {}) | more))
     rows = 0
-    order = sim.scene.parameters.order
-    asked = (
-        {} if order == "alternating" else {"order": order}
-    )  # whose contacts stand as they are swept
     for _ in range(30):
         problem = sim.constraint_problem()
-        asked |= {"seed": sim.sweep_seed()} if order == "random" else {}
+        asked = {"order": sim.sweep_order()}
+        asked |= {"seed": sim.sweep_seed()} if more.get("order") == "random" else {}
         budget = sim.solver_iterations
         expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=budget, **asked).impulse
         observation, *_ = sim.step()

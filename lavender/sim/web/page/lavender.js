@@ -16,7 +16,8 @@ export const SOLVER_FIELDS = [
   "iterations", "warm_start", "contacts", "cache_matches", "residual_initial", "residual_final", "violation_initial",
   "violation_final",
 ];
-export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"];
+export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating",
+  "colored_pairs"];
 
 export class Kernels {
   // `module`: a WebAssembly.Module; `layout`: arrays and indices, as listed by lavender.sim.web.scenes.

@@ -29,7 +29,7 @@ export class Side {
     this.solver = pick(".solver");
     this.told = pick(".told");
     this.canvas = pick("canvas");
-    this.order.append(...ORDERS.map((name, i) => new Option(name.replace("_", " "), i)));
+    this.order.append(...ORDERS.map((name, i) => new Option(name.replaceAll("_", " "), i)));
     this.cells = rows(pick("tbody"), [...OF_JOINTS, ...SOLVER_FIELDS]);
     this.sweeps.addEventListener("input", () => this.set({ iterations: Number(this.sweeps.value) }));
     this.warm.addEventListener("change", () => this.set({ warm_start: Number(this.warm.checked) }));
