@@ -10,6 +10,8 @@ checkout solves the same inputs in turn, and this checkout judges both answers. 
                and `found`. "Alone": the backend called by qpsolvers, with its own settings or ALONE
     problems   every file of --problems (default: the variable LAVENDER_PROBLEMS) and its folders; FCLIB is *.hdf5
     drawn      problems of `python -m benchmarks regret`
+    sequences  50 steps of the robots of `python -m benchmarks worlds`, as one batch: cold, each from the
+               solution of the step before, and from its own solution
     reports    tests/field/test_reports.py of this checkout, run with either commit
     models     published robot models (tests/field): steps whose judged answer predicts MuJoCo's own next velocity
 
@@ -25,6 +27,8 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +46,7 @@ ALONE = {
     "osqp": {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 100_000},
     "proxqp": {"eps_abs": 1e-8, "eps_rel": 1e-8},
 }
+STARTS = "cold", "from the step before", "from the solution"
 BACKENDS = ("clarabel", "piqp", "daqp", "proxqp", "quadprog", "osqp", "highs")
 
 
@@ -160,8 +165,42 @@ def step_models(tests: str) -> Answer:
     return dict(count)
 
 
+@cache
+def read_robots() -> dict[str, Any]:
+    """Return the model of each robot, or nothing without MuJoCo."""
+    if find_spec("mujoco") is None:
+        return {}
+    from benchmarks.worlds import iterate_robots
+
+    return dict(iterate_robots())
+
+
+def solve_sequence(robot: str, start: str) -> Answer:
+    """Solve the recorded steps of a robot from one of STARTS; `relative` is the largest one of a step above TOL."""
+    import lavender as lv
+    from benchmarks.worlds import record_states
+
+    states = record_states(read_robots()[robot])
+    before, batch = (
+        lv.io.from_mujoco_many(read_robots()[robot], x)[0] for x in (states[:-1], states[1:])
+    )
+    given = None
+    if start != STARTS[0]:
+        solved = lv.solve_many(before if start == STARTS[1] else batch, tol=TOL)
+        given = batch.make_start(solved)
+    runs = [run_timed(partial(lv.solve_many, batch, impulse=given, tol=TOL)) for _ in range(5)]
+    many = runs[0][0]
+    return {
+        "status": str(Counter(status.name for status in many.status)),
+        "work": dict(sum((Counter(s.work) for s in many), Counter[str]())),
+        "relative": float(np.where(many.success, 0.0, many.relative).max(initial=0.0)),
+        "seconds": min(seconds for _, seconds in runs),
+    }
+
+
 CALLS: dict[str, Callable[..., Answer]] = {
-    f.__name__: f for f in (solve_program, solve_program_alone, solve_problem, step_models)
+    f.__name__: f
+    for f in (solve_program, solve_program_alone, solve_problem, solve_sequence, step_models)
 }
 
 
@@ -227,6 +266,20 @@ def compare_problems(
                     "base": answers[0],
                     "head": answers[1],
                 }
+
+
+def compare_sequences(sides: list[Checkout]) -> Iterator[Answer]:
+    """Yield a row for each robot and start."""
+    for robot in read_robots():
+        for start in STARTS:
+            base, head = ask_both(sides, "solve_sequence", robot, start)
+            yield {
+                "group": "sequences",
+                "name": robot,
+                "solver": start,
+                "base": base,
+                "head": head,
+            }
 
 
 def list_problems(folder: Path) -> list[tuple[str, Path]]:
@@ -341,8 +394,6 @@ def list_changes(rows: list[Answer]) -> Iterator[str]:
 
 def list_models(sides: list[Checkout]) -> Iterator[str]:
     """Yield a sentence on the published models for each commit, or on what is missing."""
-    from importlib.util import find_spec
-
     if find_spec("mujoco") is None:
         yield "robot models: mujoco is not installed"
         return
@@ -405,6 +456,7 @@ def make_command() -> Any:
             rows = [
                 *compare_programs(sides, programs, backends),
                 *compare_problems(sides, files, solvers),
+                *compare_sequences(sides),
             ]
             head = [
                 "inputs",

@@ -10,6 +10,9 @@ Sheets, all in CPU time of one thread, minima of calls that alternate:
     sequences   50 recorded steps of the robots of gymnasium and dm_control, if installed, started from the step before
     motions     judging worlds that MuJoCo moves by forces and by accelerations
     loop        import, judge, solve and step of many worlds over 50 steps with changing contacts
+    import      reading a step of four boxes (64 rows) with `from_mujoco`, and reading and solving it
+
+The last lines of a table are the geometric means of its ratios, and the largest ratios that are wanted.
 """
 
 from __future__ import annotations
@@ -50,6 +53,20 @@ HOPPER = """<mujoco><option timestep="0.004"/><default><joint damping="1"/></def
 <joint name="knee" axis="0 1 0" range="0 120" limited="true"/>
 <geom type="capsule" size=".04" fromto="0 0 0 -.1 0 -.3"/></body></body></body></worldbody>
 <actuator><motor joint="hip" gear="20"/><motor joint="knee" gear="20"/></actuator></mujoco>"""
+
+BOXES = "".join(
+    f'<body pos="{0.5 * i} 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+    for i in range(4)
+)
+#: Wanted ratios of each sheet by column; times [us] of the sheet `import`.
+WANTED = {
+    "batch": {"next step": "0.80", "the solution": "0.90 at 12 rows, 0.60 at 30", "noise": "1.60"},
+    "single": {"next step": "0.80", "the solution": "0.90 at 12 rows, 0.60 at 30"},
+    "gradients": {"vjp": "10 us at 3 rows, then 5.00"},
+    "sequences": {"next step": "0.80"},
+    "motions": {"judge": "1.2 of the first row's"},
+    "import": {"read [us]": "15.0", "read and solved": "30 us"},
+}
 
 Rows = Iterator[dict[str, Any]]
 
@@ -264,6 +281,33 @@ def list_loops(worlds: int, repeats: int) -> Rows:
         yield describe(name, times, worlds * STEPS, "loop")
 
 
+def list_imports(worlds: int, repeats: int) -> Rows:
+    """Yield the sheet `import`."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="0 0 1"/>{BOXES}</worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    for _ in range(STEPS):
+        mujoco.mj_step(model, data)
+    read = partial(lv.io.from_mujoco, model, data)
+    times = time_alternately(read, lambda: lv.solve(read()), rounds=repeats).min(axis=0)
+    best = dict(zip(("read", "read and solved"), times.tolist(), strict=True))
+    yield describe(f"four boxes, {read().m} rows", best, 1, "read")
+
+
+def summarize(name: str, rows: list[dict[str, Any]]) -> Rows:
+    """Yield the geometric means of the ratios of a sheet, and the wanted ones."""
+    means = {}
+    for column in rows[0]:
+        texts = [row[column] for row in rows]
+        if column != "worlds" and "[" not in column and not any("->" in x for x in texts):
+            means[column] = f"{np.exp(np.mean(np.log(np.array(texts, float)))):.2f}"
+    for line, cells in (("geometric mean", means), ("wanted", WANTED.get(name, {}))):
+        yield {column: cells.get(column, "") for column in rows[0]} | {"worlds": line}
+
+
 SHEETS = {
     "batch": list_batches,
     "single": list_singles,
@@ -271,6 +315,7 @@ SHEETS = {
     "sequences": list_sequences,
     "motions": list_motions,
     "loop": list_loops,
+    "import": list_imports,
 }
 
 
@@ -285,13 +330,14 @@ def command(worlds: int, repeats: int, sheets: tuple[str, ...], out: Path | None
     """Print the costs of starts, judgements and gradients of worlds; see the module."""
     lines: list[dict[str, Any]] = []
     for name in sheets or SHEETS:
-        if name in ("sequences", "motions", "loop") and find_spec("mujoco") is None:
+        if name in ("sequences", "motions", "loop", "import") and find_spec("mujoco") is None:
             click.echo(f"{name}: MuJoCo is not installed", err=True)
             continue
         rows = list(SHEETS[name](worlds, repeats))
         lines += [{"sheet": name, **row} for row in rows]
         click.echo(f"\n## {name}\n")
         if rows:
-            click.echo(markdown(list(rows[0]), [list(row.values()) for row in rows]))
+            printed = [*rows, *summarize(name, rows)]
+            click.echo(markdown(list(rows[0]), [list(row.values()) for row in printed]))
     if out is not None:
         write_json(out, lines)

@@ -119,17 +119,18 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     blocks = make_blocks(step, data)
     jac = _read_jacobian(step, data, blocks)
     before = _get_velocity_before(step)
-    b, compliance, v_free, is_regular, gap, gaps = mujoco_rows.compute_problem_numbers(
+    b, compliance, v_free, is_regular, gap, gaps, least = mujoco_rows.compute_problem_numbers(
         step, blocks, jac, before, SUM_TOLERANCE, COMPLIANCE_TOLERANCE, MAX_SAFE_ENTRY
     )
     if not is_regular:
         _check_jacobian(*gaps)
         if not gap <= COMPLIANCE_TOLERANCE:
             compliance = _compute_compliance(data) * get_row_scales(blocks) * get_row_scales(blocks)
+            least = compliance.min()
     general = Generalized.from_compressed_rows(jac, mass, v_free, like=kept.operator)
     operator = kept.operator = general.operator
     rest = kept.mj, model, blocks, b, compliance, general
-    is_stiff = step.m > 0 and compliance.min() < MAX_EXAMINED_COMPLIANCE
+    is_stiff = least < MAX_EXAMINED_COMPLIANCE
     if (
         is_regular
         and change is None
@@ -148,15 +149,15 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         if raised is not None:
             problem = replace(problem, compliance=raised)
     is_stepped, answer = before is not None, None
+    # Copies of what the step overwrites; the motion is made when it is judged.
+    *arrays, velocity = mujoco_rows.copy_answer(step)
     if step.m and not step.has_noslip:
-        # Copies of what the step overwrites; the motion is made when it is judged.
-        arrays = data.efc_force.copy(), data.qacc.copy(), data.qacc_smooth.copy()
         if change is not None:
             arrays[2][:] += change
         momentum = dt * data.qfrc_constraint if is_stiff else None
         how = kept.mj, model, model.opt.integrator, step.is_discrete, is_stepped
         answer = partial(_make_motion, how, dt, blocks, arrays, compliance, momentum, is_stiff)
-    source = EngineSource(weakref.ref(data), model, np.array(data.qvel), is_stepped)
+    source = EngineSource(weakref.ref(data), model, velocity, is_stepped)
     problem._set_record(EngineRecord(answer, source, _predict_velocity))
     return problem
 
@@ -173,7 +174,7 @@ def _make_motion(
     how: tuple[Any, ...],
     dt: float,
     blocks: Any,
-    arrays: tuple[FloatArray, ...],
+    arrays: list[FloatArray],
     compliance: FloatArray,
     momentum: FloatArray | None,
     is_stiff: bool,

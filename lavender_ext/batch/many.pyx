@@ -7,7 +7,7 @@ caller, for the general solvers: these are called deferred.
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, fabs
-from libc.stdlib cimport calloc, free
+from libc.stdlib cimport calloc, free, qsort
 from libc.string cimport memcpy, memset
 
 cimport cython
@@ -16,18 +16,20 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport (C_CONTIGUOUS, DOUBLE, as_double_pointer, as_int_pointer, has_element_type, make_read_only,
                                        ndarray)
+from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.checks cimport make_instance
 from lavender_ext.core.deadline cimport deadline_t, get_pointer, has_passed, read_clock, reading_interval
 from lavender_ext.core.generalized cimport solve_mass_matrix
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.problem cimport Data, bind_body_arrays, derived_t
+from lavender_ext.core.problem cimport Data, Workspace, allocate_bytes, bind_body_arrays, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.small.call cimport derive_small_problem, judge_task, solve_small
 from lavender_ext.small.task cimport (N_CALL_WORKSPACES, N_COUNTS, RESULT_FAILED, RESULT_IS_START, WORK, count_task_scratch,
                                       small_rules_t, task_t)
 from lavender_ext.batch.adjoint cimport adjoin_task, adjoint_t, cotangents_t
+from lavender_ext.batch.gather cimport gather_tasks, set_places_of_task
 from lavender_ext.batch.motion cimport judge_motion, motion_error_t, motion_t
 from lavender_ext.batch.task cimport prepare_task, solve_generalized_task, solve_task
 from lavender_ext.small.limits cimport estimate_newton_cost_terms, limits_t, max_newton_cost, newton_cost_t
@@ -73,13 +75,15 @@ cdef enum:
     MAX_KEPT_NUMBERS = 1 << 16      # Workspaces are freed at the end of a call if one has more numbers.
     INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
     CACHE_LINE_DOUBLES = 8          # doubles of a cache line, 64 bytes
+    MIN_LISTED_ROWS = 8             # Problems of a list with fewer rows take as long alone as to be copied to lanes.
     MAX_LANE_PAUSE = 31             # groups of worlds without lanes, where lanes cover none
 
 cdef enum:                      # indices of a worker's own workspaces, which follow the workspaces of a call
     SLACK_ERROR = N_CALL_WORKSPACES
     BY_ISLAND = N_CALL_WORKSPACES + 1
     LANES = N_CALL_WORKSPACES + 2
-    N_WORKSPACES = N_CALL_WORKSPACES + 3
+    GATHERED = N_CALL_WORKSPACES + 3
+    N_WORKSPACES = N_CALL_WORKSPACES + 4
 
 
 cdef int set_task_from_problem(task_t* j, problem) except -1:
@@ -439,6 +443,23 @@ cdef struct worker_t:             # memory of one thread
     int32_t pause, idle             # groups without lanes after the last group that lanes did not cover; those to come
 
 
+cdef struct place_t:            # by which worlds are ordered
+    int64_t key
+    int64_t order
+    int64_t world
+
+
+cdef int compare_places(const void* first, const void* second) noexcept nogil:
+    """Compare two places for `qsort`, which need not be stable."""
+    cdef const int64_t* a = <const int64_t*>first
+    cdef const int64_t* b = <const int64_t*>second
+    cdef int32_t i
+    for i in range(3):
+        if a[i] != b[i]:
+            return -1 if a[i] < b[i] else 1
+    return 0
+
+
 cdef class Worlds:
     """Problems of a batch and their results. Problems are objects, or are converted from a few arrays when they are solved.
 
@@ -466,8 +487,9 @@ cdef class Worlds:
     cdef int64_t taken
     cdef bint cold
     cdef public int width           # number of worlds that a worker takes at a time, to process them in lanes: 1, 2, 4 or 8
-    cdef object order               # worlds (places,) in the order in which they are processed in lanes; -1: none
-    cdef const int64_t* order_at
+    cdef Workspace order            # memory of `order_at`
+    cdef const int64_t* order_at    # worlds (n_places) in the order in which they are processed in lanes; -1: none
+    cdef int64_t n_places
     cdef readonly object numbers, worst, counts, code, impulse, velocity
     cdef list references
     cdef double* lam
@@ -509,23 +531,47 @@ cdef class Worlds:
             self.w.array[i] = NULL if arrays[i] is None else (<ndarray>arrays[i]).data
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
 
-    cdef void order_worlds(self):
+    cdef place_t find_place(self, int64_t i) noexcept nogil:
+        """Return the place of world i; problems with and without a start, or of two laws, have different keys."""
+        cdef place_t place = place_t(0, 0, i)
+        cdef worlds_t one
+        cdef int64_t at[PLACES]
+        cdef task_t* j
+        if self.tasks == NULL:
+            place.key = compute_structure_key(&self.w, i, &place.order)
+        elif self.tasks[i].v.g != NULL and self.tasks[i].v.p.n_rows >= MIN_LISTED_ROWS:
+            memset(at, 0, sizeof(at))
+            j = &self.tasks[i]
+            set_places_of_task(j, at)
+            one.at, one.blocks = at, j.v.p
+            place.key = compute_structure_key(&one, 0, &place.order)
+            if place.key != 0:
+                place.key = 4 * place.key + 2 * (j.v.p.law == CONE) + j.cold
+        return place
+
+    cdef int order_worlds(self) except -1:
         """Order the worlds by their structure, in groups of MAX_LANES; -1 fills the last group of each structure."""
-        cdef int64_t i
-        cdef int64_t[:, ::1] key
-        cdef const int64_t[::1] order
-        both = np.empty((2, self.w.n), np.int64)
-        key = both
-        for i in range(self.w.n):
-            key[1, i] = compute_structure_key(&self.w, i, &key[0, i])
-        by, keys = np.lexsort(both), both[1]
-        sizes = np.diff(np.flatnonzero(np.diff(keys[by])) + 1, prepend=0, append=self.w.n)
-        places = -(-sizes // MAX_LANES) * MAX_LANES
-        ordered = np.full(places.sum(), -1)
-        ordered[np.arange(self.w.n) + np.repeat(np.cumsum(places - sizes) - (places - sizes), sizes)] = by
+        cdef int64_t i, k = 0, n = self.w.n, size = 0
+        cdef int64_t* order
+        cdef Workspace ordered, memory = allocate_bytes(n * sizeof(place_t))
+        cdef place_t* place = <place_t*>memory.at
+        for i in range(n):
+            place[i] = self.find_place(i)
+        qsort(place, n, sizeof(place_t), &compare_places)
+        for i in range(n):                              # number of places
+            size += 1 if size % MAX_LANES == 0 or place[i].key == place[i - 1].key else MAX_LANES - size % MAX_LANES + 1
+        size = (size + MAX_LANES - 1) // MAX_LANES * MAX_LANES
+        ordered = allocate_bytes(size * sizeof(int64_t))
+        order = <int64_t*>ordered.at
+        memset(order, 255, size * sizeof(int64_t))      # -1
+        for i in range(n):
+            if i > 0 and place[i].key != place[i - 1].key:
+                k = (k + MAX_LANES - 1) // MAX_LANES * MAX_LANES
+            order[k] = place[i].world
+            k += 1
         if self.order is None:                          # Another thread may have ordered the worlds.
-            order = ordered
-            self.order, self.order_at = ordered, &order[0] if self.w.n else NULL
+            self.order, self.order_at, self.n_places = ordered, order, size
+        return 0
 
     def set_from_problems(self, list problems, list data, list starts):
         """Set the worlds from problems and their `list_problem_data`; None defers a problem to the caller."""
@@ -535,6 +581,7 @@ cdef class Worlds:
         if self.tasks == NULL:
             raise MemoryError(f"{self.w.n} problems")
         self.references += [problems, data]
+        self.width = count_lanes()
         for i in range(self.w.n):
             p, j = data[i], &self.tasks[i]
             if p is None:
@@ -598,21 +645,34 @@ cdef class Worlds:
         cdef lanes_t x
         cdef lane_rows_t rows
         cdef task_t j
+        cdef const worlds_t* w = &self.w
+        cdef worlds_t gathered
+        cdef int64_t places[MAX_LANES * PLACES]
+        cdef int64_t own[MAX_LANES]
         cdef const int64_t* at
+        cdef const int64_t* which = worlds
         cdef int32_t lane, k, r, done = 0, width = self.width
         cdef double* lam
         cdef int64_t i, n = self.w.n + 1
         cdef double* v
-        if not arrange_lanes(&self.w, worlds, n_worlds, width, &x, &rows):
+        x.warm = not self.cold
+        if self.tasks != NULL:
+            if n_worlds < 2 or self.find_place(worlds[0]).key == 0 \
+                    or not gather_tasks(self.tasks, worlds, n_worlds, self.w.at, &h.at[GATHERED], places, &gathered):
+                return -1
+            for lane in range(n_worlds):
+                own[lane] = lane
+            w, which, x.warm = &gathered, own, not self.tasks[worlds[0]].cold
+        if not arrange_lanes(w, which, n_worlds, width, &x, &rows):
             return -1
-        x.asymmetry = self.w.asymmetry if self.w.mass_ptr == NULL else -1.0
+        x.asymmetry = w.asymmetry if w.mass_ptr == NULL else -1.0
         if not grow_workspace_to(&h.at[LANES], 0, bind_lanes(&x, width, NULL) + CACHE_LINE_DOUBLES):
             return -1
         # A kernel with vectors that lie across two cache lines takes up to 1.3 times as long.
         bind_lanes(&x, width, <double*>((<size_t>h.at[LANES].real + 63) & ~<size_t>63))
-        load_lanes(&x, &rows, &self.w, self.lam, worlds, n_worlds, width)
+        load_lanes(&x, &rows, w, self.lam, which, n_worlds, width)
         prepare_lanes(&x, width)
-        x.tol, x.warm = tol, not self.cold
+        x.tol = tol
         if not judges:
             solve_lanes(&x, width)
         judge_lanes(&x, width)
@@ -643,8 +703,10 @@ cdef class Worlds:
             if judges:
                 self.number[RHS_ENERGY * n + i] = lane_number(&x, LANE_RHS, width, lane)
             v = self.v + at[VELOCITY]
-            for k in range(x.n):
+            for k in range(x.n if self.tasks == NULL else 0):
                 v[k] = x.free[k * width + lane] + x.push[k * width + lane]
+            if self.tasks != NULL:
+                memcpy(self.tasks[i].zero_residual, j.zero_residual, sizeof(j.zero_residual))
             self.code_at[i] = READY
             done += 1
         return done
@@ -876,18 +938,18 @@ cdef class Worker:
         cdef const int64_t* order = NULL
         cdef int64_t i, n = w.w.n
         cdef int32_t code, n_group, n_done = 0
-        cdef bint is_late, uses_lanes = not narrow
+        cdef bint is_late, uses_lanes = not narrow and w.tasks == NULL     # Single judgements of a list take as long.
         cdef deadline_t own                             # Other threads read the clock for themselves.
         cdef deadline_t* until = get_pointer(deadline)
         if until != NULL:
             own = until[0]
             until = &own
-        if not judges:
-            uses_lanes = limits != NULL and limits.lanes != 0.0
+        if not judges:          # Problems of a list share groups only in the order by structure.
+            uses_lanes = limits != NULL and limits.lanes != 0.0 and (w.tasks == NULL or until == NULL)
         if uses_lanes and w.width > 1 and until == NULL:        # With a limit of time, worlds are solved in their own order.
             if w.order is None:                         # Only lanes need the order.
                 w.order_worlds()
-            order, n = w.order_at, len(w.order)
+            order, n = w.order_at, w.n_places
         with nogil:
             while not self.stop[0]:
                 if self.h.next == self.h.end:

@@ -390,8 +390,14 @@ def find_velocity_before(Step step, double tolerance, double alike):
     return v
 
 
+cdef ndarray copy_array(const double* x, Py_ssize_t n):
+    cdef ndarray out = new(n)
+    memcpy(out.data, x, n * sizeof(double))
+    return out
+
+
 def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tolerance, double compliance_tolerance, double usual):
-    """Return (b, compliance, v*, is_regular, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
+    """Return (b, compliance, v*, is_regular, max |efc_R efc_D - 1|, gaps, least compliance) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
@@ -415,7 +421,7 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
     cdef double* force_size = force + n
     cdef double* change = force + 2 * n
     cdef double dt = p.dt, x, size, row_v, row_change, f
-    cdef double finite = 0.0, compliance_gap = 0.0, max_b = 0.0, max_v = 0.0, max_change = 0.0
+    cdef double finite = 0.0, compliance_gap = 0.0, max_b = 0.0, max_v = 0.0, max_change = 0.0, least = INFINITY
     cdef double[3] gap = [0.0, 0.0, 0.0], terms = [0.0, 0.0, 0.0], stored = [0.0, 0.0, 0.0]
     cdef bint is_regular = True
     for j in range(n):
@@ -436,6 +442,7 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
             force_size[j] += fabs(x * f)
         b[i] = dt * scale[i] * p.efc_aref[i] - row_change
         compliance[i] = p.efc_R[i] * scale[i] * scale[i]
+        least = min(least, compliance[i])
         max_b = update_max_abs(max_b, b[i])
         is_regular &= is_valid_magnitude(compliance[i]) and compliance[i] <= usual
         compliance_gap = update_max_abs(compliance_gap, p.efc_R[i] * p.efc_D[i] - 1.0)
@@ -459,7 +466,13 @@ def compute_problem_numbers(Step step, Blocks blocks, tuple jac, v_, double tole
         is_regular &= gap[j] <= tolerance
     is_regular &= compliance_gap <= compliance_tolerance and finite == 0.0 and is_valid_magnitude(max_b)
     return (make_read_only(b_), make_read_only(compliance_), make_read_only(free_), is_regular, compliance_gap,
-            (gap[0], gap[1], gap[2], finite))
+            (gap[0], gap[1], gap[2], finite), least)
+
+
+def copy_answer(Step step):
+    """Return copies of efc_force (m,), and of qacc, qacc_smooth and qvel (nv,)."""
+    return (copy_array(step.at.efc_force, step.m), copy_array(step.at.qacc, step.n), copy_array(step.at.qacc_smooth, step.n),
+            copy_array(step.at.qvel, step.n))
 
 
 def copy_rows(Step step, Blocks blocks):

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from benchmarks import corpus, pairs
+from benchmarks import corpus, pairs, worlds
 
 PROGRAMS = Path(__file__).parents[1] / "field" / "programs"
 OPTIMA = json.loads((PROGRAMS / "objectives.json").read_text())
@@ -53,6 +54,22 @@ def test_two_checkouts_answer_alike_and_survive_an_error(tmp_path):
     for side in sides:
         side.process.communicate()
         assert side.process.returncode == 0
+
+
+def test_sequences_are_solved_from_every_start_and_by_less_work_near_it(monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    robot = {"hopper": mujoco.MjModel.from_xml_string(worlds.HOPPER)}
+    monkeypatch.setattr(corpus, "read_robots", lambda: robot)
+    cold, warm, exact = (corpus.solve_sequence("hopper", start) for start in corpus.STARTS)
+    assert all(corpus.is_solved(answer) for answer in (cold, warm, exact))
+    assert warm["work"]["sweeps"] < cold["work"]["sweeps"] and not exact["work"].get("sweeps")
+
+
+def test_sheets_end_with_means_of_ratios_and_wanted_ones():
+    best = [worlds.describe("a", {"cold": 1.0, "next step": x}, 1) for x in (0.5, 2.0)]
+    mean, wanted = worlds.summarize("sequences", best)
+    assert list(mean.values()) == ["geometric mean", "", "1.00"]
+    assert list(wanted) == list(best[0]) and wanted["next step"] == "0.80"
 
 
 def test_pairs_compare_a_statement_of_two_checkouts_and_report_an_error():

@@ -215,12 +215,25 @@ def check_arrays(many, batch):
         assert found.tobytes() == batch[i].velocity(solution.impulse).ravel().tobytes()
 
 
-#: Ways to solve worlds of one batch.
+def solve_list(worlds, starts, **options):
+    """Return solutions of a list that has problems of another law, without starts, between those of the worlds."""
+    law = LAWS[LAWS.index(worlds[0].law) - 1]
+    others = draw_worlds(len(worlds[0].free), len(worlds), law, nv=len(worlds[0].free))
+    problems = [w.make_problem() for both in zip(worlds, others, strict=True) for w in both]
+    impulses = [start for _, x in pair(worlds, starts) for start in (x, None)]
+    many = lv.solve_many(problems, impulses=impulses, **options)
+    return [many[i] for i in range(0, len(problems), 2)]
+
+
+#: Ways to solve worlds of one batch or of a list.
 BATCHES = {
     **{f"{name}, in lanes of {width}": functools.partial(solve_batch, layout=name, width=width, order=order)
        for (name, width, order) in (("rows", 1, 1), ("triangles", 2, -1), ("padded", 4, 1), ("rows", 8, -1))},
     **{f"{name}, two threads": functools.partial(solve_batch, layout=name, threads=2) for name in LAYOUTS},
     "rows and a time limit": functools.partial(solve_batch, layout="rows", time_limit=600.0),
+    "a list": solve_list,
+    "a list, two threads": functools.partial(solve_list, threads=2),
+    "a list and a time limit": functools.partial(solve_list, time_limit=600.0),
 }  # fmt: skip
 
 
