@@ -18,6 +18,7 @@ from lavender.base.arrays import FloatArray
 from lavender.causes.difference import Difference
 from lavender.causes.matching import Pairing
 from lavender.causes.mixture import INGREDIENTS, PARTS, solve_mixture
+from lavender.causes.smaller_steps import COUNT
 from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
 from lavender.report.text import format_count
 
@@ -366,7 +367,7 @@ def describe_change(comparison: Difference, name: str) -> str:
 
 def _propose_settings(comparison: Difference) -> list[Proposal]:
     """Return settings of one engine that bring its step nearer to the rigid laws, best first."""
-    record, ideal = comparison.b, comparison.exact_a
+    record, ideal = comparison.b, comparison.a.velocity_after
     before = float(np.abs(comparison.exact_b - ideal).max(initial=0.0))
     found = []
     for text, causes, changed in _iterate_settings(record):
@@ -378,6 +379,11 @@ def _propose_settings(comparison: Difference) -> list[Proposal]:
             continue
         left = float(np.abs(step.velocity - ideal).max(initial=0.0))
         found.append(Proposal(text, left, before, causes))
+    if "time step" in comparison.parts:
+        finer = comparison.difference - comparison.parts["time step"].alone_in_b
+        before = float(np.abs(comparison.difference).max(initial=0.0))
+        left = float(np.abs(finer).max(initial=0.0))
+        found.append(Proposal(f"timestep={record.dt / COUNT:g}", left, before, ("time step",)))
     found = [p for p in found if p.improvement >= MIN_IMPROVEMENT]
     return sorted(found, key=lambda p: p.left)[:3]
 
