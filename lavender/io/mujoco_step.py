@@ -542,6 +542,8 @@ class StepReader:
                  int(mj.mjtObj.mjOBJ_FLEX): "flex"}  # fmt: skip
         known = {int(mj.mjtObj.mjOBJ_BODY): self.bodies, int(mj.mjtObj.mjOBJ_JOINT): self.joints}
         object_type = int(model.eq_objtype[i])
+        if kind == "joint":  # Engines that make such a model themselves may leave the type out.
+            object_type = int(mj.mjtObj.mjOBJ_JOINT)
         names = []
         for number in (int(model.eq_obj1id[i]), int(model.eq_obj2id[i])):
             if number >= 0 and object_type in known:
