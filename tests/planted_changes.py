@@ -14,7 +14,15 @@ import numpy as np
 
 FOLDER = Path(__file__).parent / "causes" / "models"
 # Steps before the compared one. The sled, which friction lifts, leaves the floor in its first step.
-SETTLING_STEPS = {"gripper": 3, "sliding": 0, "arm": 3, "loop": 3, "tendon": 3, "ball": 3}
+SETTLING_STEPS = {
+    "gripper": 3,
+    "sliding": 0,
+    "arm": 3,
+    "loop": 3,
+    "tendon": 3,
+    "ball": 3,
+    "swimmer": 3,
+}
 Change = Callable[[Any], None]
 
 
@@ -175,6 +183,15 @@ OWN: dict[str, dict[str, tuple[Change, str]]] = {
         "frictionloss": (scale("tendon_frictionloss", ALL, 2.0), "friction"),
         "damping of tendons": (scale("tendon_damping", ALL, 3.0), "integrator"),
         "gain": (scale("actuator_gainprm", (0, 0), 2.0), "integrator"),
+    },
+    "swimmer": {
+        "mass of one body": (heavier(2, 1.6), "mass"),
+        "inertia of one body": (scale("body_inertia", 3, 2.0), "mass"),
+        "density": (option("density", 700.0), "integrator"),
+        "viscosity": (option("viscosity", 0.5), "integrator"),
+        "wind": (option("wind", (0.5, 0.0, -0.2)), "integrator"),
+        "frictionloss": (scale("dof_frictionloss", ALL, 2.0), "friction"),
+        "range": (put("jnt_range", (1, 1), 0.402), "rows"),
     },
     "ball": {
         "mass of one body": (heavier(1, 2.0), "mass"),

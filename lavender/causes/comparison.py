@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from lavender.causes.facts import Fact, Proposal, list_facts, list_proposals
 from lavender.causes.ideal import make_ideal_twin
 from lavender.causes.matching import Pairing
 from lavender.causes.mixture import INGREDIENTS, PARTS
+from lavender.causes.smaller_steps import measure_time_step
 from lavender.causes.text import describe
 from lavender.io.step_record import StepRecord, get_force
 
@@ -69,7 +71,9 @@ class Comparison(Difference):
         return describe(self)
 
 
-def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
+def compare(
+    a: StepRecord, b: StepRecord | None = None, *, simulation: tuple[Any, Any] | None = None
+) -> Comparison:
     """Explain the difference of the velocities of two engines after one step.
 
     Parameters
@@ -78,6 +82,9 @@ def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
         The same step of two engines, two versions, two models or two sets of options, from
         `lavender.io.step_from_mujoco` and its siblings or from a file of `lavender.io.save_step`. Without `b`, `a` is
         compared with the rigid laws: the first record of the result is the ideal twin of `a`.
+    simulation : (mujoco.MjModel, mujoco.MjData), optional
+        The model, and the state before the step of `a`; they are not changed. The rigid laws are then those of smaller
+        steps (`lavender.causes.smaller_steps`), and the difference has a part "time step".
 
     Returns
     -------
@@ -86,7 +93,8 @@ def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
     Raises
     ------
     InputError
-        The steps differ in their length, in the number of velocities, or in the velocities before the step.
+        The steps differ in their length, in the number of velocities, or in the velocities before the step; or
+        `simulation` is given for two records, or has another state.
     CapabilityError
         An exact solution of one of the steps is not found.
 
@@ -102,6 +110,10 @@ def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
                 "step_from_newton_mujoco or load_step is needed"
             )
     is_ideal = b is None
+    if simulation is not None and not is_ideal:
+        raise InputError(
+            "simulation is given for two records; it is for one against the rigid laws"
+        )
     if b is None:
         a, b = make_ideal_twin(a), a
     _check_steps(a, b)
@@ -126,13 +138,20 @@ def compare(a: StepRecord, b: StepRecord | None = None) -> Comparison:
         a, b, exact_a.velocity, exact_b, whole.velocity, exact_a.is_raised or whole.is_raised
     )
     own |= leaves
+    warnings = list(solved.warnings)
+    if simulation is not None:
+        try:
+            velocity, own["time step"] = measure_time_step(b, a, *simulation)
+            a = replace(a, velocity_after=velocity)
+        except CapabilityError as error:
+            warnings.append(f"the part of the time step is not known: in a smaller step, {error}")
     corners = {
         bits: solved.solve(expand(dict(zip(active, bits, strict=True))))
         for bits in itertools.product((False, True), repeat=len(active))
     }
     result = Comparison(
         a, b, own, exact_a.velocity, exact_b, pairing, corners, active, is_ideal,
-        tuple(solved.warnings),
+        tuple(warnings),
     )  # fmt: skip
     return result
 

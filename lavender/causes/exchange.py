@@ -14,6 +14,8 @@ from lavender.causes.matching import Pairing
 from lavender.causes.mixture import INGREDIENTS, PARTS, Mixture, solve_mixture
 from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
 
+FLUID = ("fluid_force", "fluid_matrix")
+
 
 class Mixtures:
     """Solved mixtures of two records."""
@@ -104,18 +106,23 @@ def expand(context: Mapping[str, bool]) -> dict[str, bool]:
 def find_different_parts(a: StepRecord, b: StepRecord, pairing: Pairing) -> frozenset[str]:
     """Return the parts of the step in which two records differ by a bit."""
     different = set()
+    has_same_fluid = _are_equal(a.fluid, b.fluid)
+    inertial = FLUID if has_same_fluid else ()
+    if not a.uses_coriolis is b.uses_coriolis is None:
+        inertial = (*inertial, "coriolis_matrix")
     arrays = {
-        "mass": ("mass", "coriolis", "gravity_map"),
+        "mass": ("mass", "coriolis", "gravity_map", *inertial),
         "force": ("force", "gravity", "stiffness_matrix"),
-        "damping": ("damping_matrix", "damping_force", "fluid_matrix"),
+        "damping": ("damping_matrix", "damping_force", *(() if has_same_fluid else FLUID)),
         "actuators": ("actuator_matrix", "actuator_force"),
-        "method": ("integrator_matrix", "integrator_force", "velocity_change"),
+        "method": ("integrator_matrix", "integrator_force", "velocity_change", "uses_coriolis"),
     }
     for part, names in arrays.items():
         if not all(_are_equal(getattr(a, x), getattr(b, x)) for x in names):
             different.add(part)
     flags = (
-        "uses_damping", "uses_fluid", "uses_actuators", "uses_stiffness", "in_problem", "implicit_rows"
+        "uses_damping", "uses_fluid", "uses_actuators", "uses_stiffness", "in_problem",
+        "implicit_rows",
     )  # fmt: skip
     if any(getattr(a, x) != getattr(b, x) for x in flags):
         different.add("method")

@@ -18,6 +18,7 @@ from lavender.base.arrays import FloatArray
 from lavender.causes.difference import Difference
 from lavender.causes.matching import Pairing
 from lavender.causes.mixture import INGREDIENTS, PARTS, solve_mixture
+from lavender.causes.smaller_steps import COUNT
 from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
 from lavender.report.text import format_count
 
@@ -27,7 +28,7 @@ MIN_IMPROVEMENT = 0.1
 # [-] Of several changes, the smallest one is proposed whose improvement is at most this much below the best.
 IMPROVEMENT_TOLERANCE = 0.02
 SETTABLE = ("mass", "force", "integrator", "softness", "friction")
-WEIGHT_TOLERANCE = 1e-4  # [-] The same, of inverse masses in float32.
+WEIGHT_TOLERANCE = 1e-4  # [-] The same, of masses and inverse masses in float32.
 ROLE_WORDS = {
     "contact": ("contact", "contacts"), "limit": ("limit", "limits"),
     "equality": ("equality", "equalities"), "friction": ("joint's dry friction", "joints' dry friction"),
@@ -69,11 +70,16 @@ def list_facts(comparison: Difference) -> list[Fact]:
     return facts + list(_compare_friction(a, b, pairing))
 
 
-def _differ(x: Any, y: Any) -> bool:
+def _find_limit(a: StepRecord, b: StepRecord) -> float:
+    """Return the relative difference [-] of masses up to which they are equal to rounding."""
+    return WEIGHT_TOLERANCE if "float32" in (a.precision, b.precision) else RELATIVE_TOLERANCE
+
+
+def _differ(x: Any, y: Any, limit: float = RELATIVE_TOLERANCE) -> bool:
     """Return whether numbers differ by more than rounding."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     return x.shape != y.shape or bool(
-        (np.abs(x - y) > RELATIVE_TOLERANCE * np.maximum(np.abs(x), np.abs(y)) + 1e-12).any()
+        (np.abs(x - y) > limit * np.maximum(np.abs(x), np.abs(y)) + 1e-12).any()
     )
 
 
@@ -89,6 +95,7 @@ def _compare_matrices(a: StepRecord, b: StepRecord) -> Iterator[Fact]:
         size = np.maximum(np.abs(x), np.abs(y))
         return int(np.argmax(np.abs(x - y) / np.where(size > 0.0, size, 1.0)))
 
+    limit = _find_limit(a, b)
     for part, name, word, unit in (
         ("mass", "mass", "mass of", "kg m2"),
         ("damping", "damping_matrix", "damping of", "N m s"),
@@ -96,11 +103,11 @@ def _compare_matrices(a: StepRecord, b: StepRecord) -> Iterator[Fact]:
         ("force", "stiffness_matrix", "stiffness of", "N m"),
     ):
         x, y = np.diag(getattr(a, name)), np.diag(getattr(b, name))
-        if _differ(x, y):
+        if _differ(x, y, limit):
             i = find_largest(x, y)
             unit = unit if a.angular[i] else unit.replace(" m2", "").replace("N m s", "N s/m")
             unit = "N/m" if unit == "N m" and not a.angular[i] else unit
-            more = int(np.count_nonzero(np.abs(x - y) > RELATIVE_TOLERANCE * np.maximum(x, y))) - 1
+            more = int(np.count_nonzero(np.abs(x - y) > limit * np.maximum(x, y))) - 1
             others = f" and {more} other velocities" if more > 0 else ""
             yield Fact(part, f"{word} {a.names[i]}{others}: {x[i]:.4g} and {y[i]:.4g} {unit}")
     if _differ(a.gravity, b.gravity):
@@ -145,9 +152,9 @@ def _compare_weights(a: StepRecord, b: StepRecord, pairing: Pairing) -> Iterator
         (x, x.weight[0], b.blocks[j].weight[0])
         for x, j in zip(a.blocks, pairing.partners[0], strict=True) if j >= 0
     ]  # fmt: skip
-    if _differ(np.diag(a.mass), np.diag(b.mass)):
+    limit = _find_limit(a, b)
+    if _differ(np.diag(a.mass), np.diag(b.mass), limit):
         return
-    limit = WEIGHT_TOLERANCE if "float32" in (a.precision, b.precision) else RELATIVE_TOLERANCE
     unlike = [(x, y, z) for x, y, z in pairs if abs(y - z) > limit * max(abs(y), abs(z))]
     if unlike:
         block, x, y = max(unlike, key=lambda p: abs(p[1] - p[2]) / max(abs(p[1]), abs(p[2])))
@@ -366,7 +373,7 @@ def describe_change(comparison: Difference, name: str) -> str:
 
 def _propose_settings(comparison: Difference) -> list[Proposal]:
     """Return settings of one engine that bring its step nearer to the rigid laws, best first."""
-    record, ideal = comparison.b, comparison.exact_a
+    record, ideal = comparison.b, comparison.a.velocity_after
     before = float(np.abs(comparison.exact_b - ideal).max(initial=0.0))
     found = []
     for text, causes, changed in _iterate_settings(record):
@@ -378,6 +385,11 @@ def _propose_settings(comparison: Difference) -> list[Proposal]:
             continue
         left = float(np.abs(step.velocity - ideal).max(initial=0.0))
         found.append(Proposal(text, left, before, causes))
+    if "time step" in comparison.parts:
+        finer = comparison.difference - comparison.parts["time step"].alone_in_b
+        before = float(np.abs(comparison.difference).max(initial=0.0))
+        left = float(np.abs(finer).max(initial=0.0))
+        found.append(Proposal(f"timestep={record.dt / COUNT:g}", left, before, ("time step",)))
     found = [p for p in found if p.improvement >= MIN_IMPROVEMENT]
     return sorted(found, key=lambda p: p.left)[:3]
 

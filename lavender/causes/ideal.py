@@ -44,8 +44,8 @@ def make_ideal_twin(record: StepRecord) -> StepRecord:
     )
     rest[np.abs(rest) < 1e-12 * np.abs(record.mass).max()] = 0.0
     twin = replace(
-        record, engine="rigid", blocks=blocks, uses_damping=True, uses_fluid=True, velocity_change=None,
-        integrator_matrix=rest,
+        record, engine="rigid", blocks=blocks, uses_damping=True, uses_fluid=True, uses_coriolis=None,
+        velocity_change=None, integrator_matrix=rest,
         in_problem=True, implicit_rows=has_springs or record.implicit_rows, law="coulomb", acceleration=None,
         before_noslip=None, softnesses=dict.fromkeys(record.softnesses, rigid),
         settings={"family": "ideal"},

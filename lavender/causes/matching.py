@@ -1,13 +1,15 @@
 """Find for each constraint of one step the same constraint in the step of another engine.
 
 Contacts of the same two bodies are matched by their geoms and then by the smallest sum of distances, whatever their
-number of rows; all other constraints by their keys. A contact without a partner has the settings that the other
-engine's geoms give it, if it has the same geoms, or borrows those of the nearest contact of the same bodies there. A
-constraint that is not active there has the settings that the other engine's model gives it, if they are known.
+number of rows; all other constraints by their keys, and equalities with other names by equal rows. A contact without a
+partner has the settings that the other engine's geoms give it, if it has the same geoms, or borrows those of the
+nearest contact of the same bodies there. A constraint that is not active there has the settings that the other engine's
+model gives it, if they are known.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
@@ -17,6 +19,8 @@ from lavender.io.step_record import ConstraintBlock, Softness, StepRecord
 
 # [m] Added to the distance of two contacts of the same bodies if their geoms have other names.
 OTHER_GEOMS_DISTANCE = 1e3
+# [-] Rows of two equalities that differ by less than this part of them are the same: float32, and rounded poses.
+SAME_ROWS = 1e-3
 
 
 @dataclass(eq=False)
@@ -46,8 +50,12 @@ class Pairing:
                 [[measure_distance(a.blocks[i], b.blocks[j]) for j in theirs] for i in ours]
             )
             for i, j in zip(*linear_sum_assignment(cost), strict=True):
-                pairing.partners[0][ours[i]] = theirs[j]
-                pairing.partners[1][theirs[j]] = ours[i]
+                pairing.join(ours[i], theirs[j])
+        equalities = [[i for i, x in enumerate(r.blocks) if x.role == "equality"] for r in (a, b)]
+        for i, j in itertools.product(*equalities):
+            is_free = pairing.partners[0][i] < 0 > pairing.partners[1][j]
+            if is_free and have_same_rows(a.blocks[i], b.blocks[j]):
+                pairing.join(i, j)
         for side, (record, other) in enumerate(((a, b), (b, a))):
             for i, block in enumerate(record.blocks):
                 partner = pairing.partners[side][i]
@@ -60,6 +68,10 @@ class Pairing:
                     partner = min(alike)[1] if alike else -1
                 pairing.lenders[side].append(partner)
         return pairing
+
+    def join(self, i: int, j: int) -> None:
+        """Make block i of the first record and block j of the second one partners."""
+        self.partners[0][i], self.partners[1][j] = j, i
 
     def side_of(self, record: StepRecord) -> int:
         """Return 0 for the first record and 1 for the second."""
@@ -110,6 +122,14 @@ class Pairing:
             x for i, x in enumerate(base.blocks)
             if x.role != "friction" and self.find_softness(source, base, i) is None
         ]  # fmt: skip
+
+
+def have_same_rows(a: ConstraintBlock, b: ConstraintBlock) -> bool:
+    """Return whether two equalities, which may have other names, constrain the same velocities."""
+    x, y = a.jacobian, b.jacobian
+    return x.shape == y.shape and bool(
+        np.allclose(x, y, rtol=0.0, atol=SAME_ROWS * np.abs(x).max())
+    )
 
 
 def measure_distance(a: ConstraintBlock, b: ConstraintBlock) -> float:

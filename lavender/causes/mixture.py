@@ -145,9 +145,8 @@ def assemble(
     base = sources["rows"]
     before = base.velocity if velocity is None else velocity
     dt, mass = base.dt, sources["mass"].mass
-    terms = ("damping", "actuators", "force")
-    added = add_matrix(sources["method"], *(sources[x] for x in terms))
-    smooth = add_forces(*(sources[x] for x in ("mass", "force", "damping", "actuators", "method")))
+    terms = [sources[x] for x in ("mass", "force", "damping", "actuators", "method")]
+    added, smooth = add_matrix(*terms), add_forces(*terms)
     in_problem = sources["method"].in_problem
     metric = mass + added if in_problem else mass
     inverse = np.asarray(np.linalg.inv(metric), float)

@@ -87,21 +87,22 @@ def compare_at_states(
         The sources have other coordinates, an option is unknown, or a stored step has no position.
     """
     options = dict(options or {})
+    pairs: list[tuple[int, StepRecord, StepRecord | None, Any]]
     if is_step_file(a):
         if states is not None or steps != 1:
             raise InputError("a stored step has its own state: leave states and steps out")
         first = load_step(a)
-        pairs = [(0, first, _read_second(first, b, options))]
+        pairs = [(0, first, _read_second(first, b, options), None)]
     else:
         pairs = list(_iterate_records(a, b, states, steps, options))
-    found = tuple(StateComparison(i, compare(x, y)) for i, x, y in pairs)
+    found = tuple(StateComparison(i, compare(x, y, simulation=s)) for i, x, y, s in pairs)
     names = [
         Path(os.fspath(s)).name if isinstance(s, str | os.PathLike) else "model"
         for s in (a, b)
         if s is not None
     ]
     title = " · ".join([*names, *(f"{k}={v}" for k, v in options.items())])
-    return Comparisons(found, title), tuple(x for _, x, _ in pairs)
+    return Comparisons(found, title), tuple(x for _, x, _, _ in pairs)
 
 
 def _read_second(first: StepRecord, b: Any, options: Mapping[str, str]) -> StepRecord | None:
@@ -127,8 +128,8 @@ def _read_second(first: StepRecord, b: Any, options: Mapping[str, str]) -> StepR
 
 def _iterate_records(
     a: Any, b: Any, states: Any, steps: int, options: Mapping[str, str]
-) -> Iterator[tuple[int, StepRecord, StepRecord | None]]:
-    """Yield (number of the state, first record, second record or None)."""
+) -> Iterator[tuple[int, StepRecord, StepRecord | None, tuple[Any, Any] | None]]:
+    """Yield (number of the state, first record, second record or None, model and state without a second record)."""
     mj = import_mujoco()
     _, model = load_model(a)
     second = None
@@ -169,7 +170,7 @@ def _iterate_records(
             other = step_from_mujoco(second, copied, engine=names[1])
         elif b is not None:
             other = load_step(b)
-        yield i, first, other
+        yield i, first, other, (model, data) if other is None else None
 
 
 def _name_models(a: Any, b: Any, options: Mapping[str, str]) -> list[str]:

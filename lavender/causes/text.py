@@ -7,6 +7,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.causes.difference import Difference, Part
 from lavender.causes.facts import Proposal, list_facts, list_parts_of, list_proposals, name_engine
+from lavender.causes.smaller_steps import COUNT
 
 MIN_SHOWN_PART = 0.01  # [-] Parts below this fraction of the difference are not listed.
 # [-] If more of the difference is left by the solvers, the text says so before it names a cause.
@@ -28,7 +29,8 @@ def describe(comparison: Difference) -> str:
     a, b = comparison.a, comparison.b
     dt = f"one step of {a.dt * 1e3:g} ms, {len(a.velocity)} velocities"
     if comparison.is_ideal:
-        head = f"why: {b.engine} against the rigid laws, {dt}, {b.n_rows} rows"
+        smaller = f" in {COUNT} smaller steps" if "time step" in comparison.parts else ""
+        head = f"why: {b.engine} against the rigid laws{smaller}, {dt}, {b.n_rows} rows"
     else:
         head = f"compare: {a.engine} and {b.engine}, {dt}, {a.n_rows} and {b.n_rows} rows"
     lines = [head, *list_cautions(comparison)]

@@ -16,13 +16,16 @@ another record.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lavender.base.arrays import FloatArray, IntArray, check_int
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.genesis import GENESIS_ADVICE, check_configuration, copy_to_host, find_solver
+from lavender.io.impedance import compute_reference
 from lavender.io.step_record import ConstraintBlock, GeomSettings, Softness, StepRecord
 
 SMALLEST_COEFFICIENT = 1e-12  # [-] Edges of a pyramid with less friction have no tangents.
@@ -100,7 +103,7 @@ class GenesisReader:
             not self.is_compatible
         ):  # In this mode the step itself updates the kinematics, before it moves.
             solver.update_forward_pos()
-            self.gravity_map = self.read_gravity_map()
+            self.read_kinematics()
         self.name_elements()
 
     def read(self, array: Any) -> FloatArray:
@@ -150,6 +153,12 @@ class GenesisReader:
                 self.is_free[dof] = is_free
                 self.angular[dof] = kind in ("REVOLUTE", "SPHERICAL") or (is_free and place >= 3)
 
+    def read_kinematics(self) -> None:
+        """Read what depends on the poses before the step."""
+        self.gravity_map = self.read_gravity_map()
+        links = self.solver.dyn_state.links
+        self.poses = self.read(links.pos), self.read(links.quat)
+
     def read_gravity_map(self) -> FloatArray:
         """Return the force per gravitational acceleration (nv, 3) from the axes of the velocities."""
         solver = self.solver
@@ -179,7 +188,7 @@ class GenesisReader:
 
         solver, dt, nv = self.solver, self.dt, self.nv
         if self.is_compatible:
-            self.gravity_map = self.read_gravity_map()
+            self.read_kinematics()
         dofs, kind = solver.dyn_state.dofs, self.config.integrator
         mass = np.asarray(copy_to_host(solver.rigid_info.mass_mat)[:, :, self.world], float)
         mass = np.tril(mass) + np.tril(mass, -1).T
@@ -381,19 +390,48 @@ class GenesisReader:
     def read_equality(
         self, key: str, rows: np.ndarray, weight: FloatArray, i: int
     ) -> ConstraintBlock:
-        """Return the block of an equality, whose gap follows from its reference, as dJ/dt v is not known apart."""
-        numbers = np.asarray(copy_to_host(self.solver.dyn_info.equalities.sol_params), float)
-        softness = self.make_softness(numbers[i, self.world])
-        rate = 2.0 / (softness.solimp[1] * softness.solref[0])
-        soft = self.compliance[rows]
-        spring = -(self.reference[rows] + rate * (self.jacobian[rows] @ self.velocity))
-        numeric = Softness(
-            "rates", rate=np.full(len(rows), rate), stiffness=np.zeros(len(rows)), compliance=soft
+        """Return the block of an equality; its bias -dJ/dt v is the rest of its reference."""
+        equalities = self.solver.dyn_info.equalities
+        numbers, places = (
+            np.asarray(copy_to_host(getattr(equalities, x)), float)[i, self.world]
+            for x in ("sol_params", "eq_data")
         )
-        return ConstraintBlock(
-            key, "equality", self.jacobian[rows], np.zeros(len(rows)), weight, numeric,
-            bias=-spring, force=self.force[rows],
+        pair = [
+            int(copy_to_host(getattr(equalities, x))[i, self.world])
+            for x in ("eq_obj1id", "eq_obj2id")
+        ]
+        jac = self.jacobian[rows]
+        block = ConstraintBlock(
+            key, "equality", jac, self.measure_equality(pair, places, len(rows)), weight,
+            self.make_softness(numbers), force=self.force[rows],
         )  # fmt: skip
+        rates, springs = compute_reference(block, block.softness, block.softness, len(rows))
+        bias = self.reference[rows] + rates * (jac @ self.velocity) + springs * block.gap
+        return replace(block, bias=bias)
+
+    def measure_equality(self, pair: list[int], data: FloatArray, count: int) -> FloatArray:
+        """Return how far an equality of two joints or two links is from being satisfied (count,) [m, rad, -]."""
+        if count == 1:
+            start = np.asarray(copy_to_host(self.solver.rigid_info.qpos0)[:, self.world], float)
+            moved = self.position - start
+            first, *others = (
+                moved[int(np.atleast_1d(j.qs_idx)[0])]
+                for x in pair for j in self.solver.joints if int(j.idx) == x
+            )  # fmt: skip
+            return np.array([first - np.polynomial.polynomial.polyval(sum(others), data[:5])])
+        positions, turns = self.poses
+        frames = [Rotation.from_quat(turns[x][[1, 2, 3, 0]]) for x in pair]
+        anchors = data[:6].reshape(2, 3)
+        if count == 6:
+            anchors = anchors[::-1]
+        first, second = (
+            positions[x] + frame.apply(y) for x, frame, y in zip(pair, frames, anchors, strict=True)
+        )
+        apart = first - second
+        if count == 6:
+            turn = frames[1].inv() * frames[0] * Rotation.from_quat(data[[7, 8, 9, 6]])
+            apart = np.append(apart, data[10] * turn.as_quat(canonical=True)[:3])
+        return np.asarray(apart, float)
 
     def read_contacts(self, first: int) -> tuple[list[ConstraintBlock], int]:
         """Return the blocks of contacts, whose rows begin at `first`, and the row after them."""

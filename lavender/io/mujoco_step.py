@@ -172,15 +172,25 @@ class StepReader:
         stiffness = self.read_stiffness()
         fluid = self.read_fluid(mass, added)
         rest = added - dt * (uses_damping * damping + uses_actuators * (actuators + fluid))
+        turning = self.read_coriolis_matrix()
+        uses_coriolis = self.find_used_coriolis(rest, dt * turning)
+        if uses_coriolis is not None:
+            rest -= dt * np.where(uses_coriolis, turning, 0.0)
         if self.is_discrete:
             rest -= dt**2 * stiffness
             integrator_force += dt * stiffness @ data.qvel
         rest[np.abs(rest) < SMALL_ENTRY * np.abs(mass).max()] = 0.0
         gravity_map, gravity = self.read_gravity()
-        damping_force = np.array(data.qfrc_damper) + self.host.qfrc_fluid
+        damping_force, fluid_force = np.array(data.qfrc_damper), np.array(self.host.qfrc_fluid)
         actuator_force = np.array(data.qfrc_actuator) - self.read_compensation()
         coriolis = np.array(data.qfrc_bias) + self.bias_map @ gravity
-        force = smooth - damping_force - actuator_force - (gravity_map @ gravity - coriolis)
+        force = (
+            smooth
+            - damping_force
+            - fluid_force
+            - actuator_force
+            - (gravity_map @ gravity - coriolis)
+        )
         groups = self.read_blocks(mass, added)
         names, angular = self.name_velocities()
         return StepRecord(
@@ -190,7 +200,8 @@ class StepReader:
             actuator_force=actuator_force, integrator_matrix=rest, integrator_force=integrator_force,
             stiffness_matrix=stiffness, uses_stiffness=self.is_discrete,
             uses_damping=uses_damping, uses_actuators=uses_actuators, in_problem=self.is_discrete,
-            fluid_matrix=fluid, uses_fluid=not is_euler, reference_position=np.array(model.qpos0),
+            fluid=self.list_fluid(), fluid_force=fluid_force, fluid_matrix=fluid, uses_fluid=not is_euler,
+            coriolis_matrix=turning, uses_coriolis=uses_coriolis, reference_position=np.array(model.qpos0),
             implicit_rows=self.is_discrete, blocks=tuple(g.block for g in groups), law="cone",
             names=names, angular=angular, position=np.array(data.qpos), position_owner=self.find_position_owner(),
             acceleration=np.array(data.qacc), moved_by=moved_by,
@@ -253,6 +264,49 @@ class StepReader:
             return (known[1] - self.measure_added_matrix(mass)) / self.dt
         finally:
             self.model = own
+
+    def list_fluid(self) -> FloatArray:
+        """Return what a user sets for a fluid: its numbers, and the shapes that replace inertias."""
+        model, option = self.model, self.model.opt
+        shaped = model.geom_fluid[:, 0] > 0.0
+        return np.concatenate([
+            [option.density, option.viscosity], option.wind, model.geom_fluid[shaped].ravel(),
+            model.geom_size[shaped].ravel(), np.flatnonzero(shaped),
+        ])  # fmt: skip
+
+    def read_coriolis_matrix(self) -> FloatArray:
+        """Return the derivative of the Coriolis and gyroscopic forces by the velocity (nv, nv) [N s/m, N m s].
+
+        They are quadratic in the velocity, so that central differences have no error but rounding.
+        """
+        mj, model = self.mj, self.model
+        scratch = mj.MjData(model)
+        mj.mj_copyData(scratch, model, self.host)
+        forces = np.empty((2, self.nv))
+        matrix = np.empty((self.nv, self.nv))
+        for i in range(self.nv):
+            for row, side in zip(forces, (1.0, -1.0), strict=True):
+                scratch.qvel[:] = self.host.qvel
+                scratch.qvel[i] += side
+                mj.mj_comVel(model, scratch)
+                mj.mj_rne(model, scratch, 0, row)
+            matrix[:, i] = 0.5 * (forces[0] - forces[1])
+        return matrix
+
+    def find_used_coriolis(self, rest: FloatArray, terms: FloatArray) -> np.ndarray | None:
+        """Return the entries of the Coriolis terms (nv, nv) that the rest of H has: all, or those of free bodies."""
+        kinds, model = self.mj.mjtIntegrator, self.model
+        kind = int(model.opt.integrator)
+        used = np.full((self.nv, self.nv), kind == int(kinds.mjINT_IMPLICIT))
+        if kind == int(kinds.mjINT_IMPLICITFAST):
+            counts = np.bincount(model.dof_treeid)
+            for dof in model.jnt_dofadr[model.jnt_type == int(self.mj.mjtJoint.mjJNT_FREE)]:
+                if counts[model.dof_treeid[dof]] == 6:
+                    used[dof : dof + 6, dof : dof + 6] = True
+        own = np.where(used, terms, 0.0)
+        # Older versions leave those of free bodies out.
+        is_used = np.abs(np.where(used, rest, 0.0) - own).max() <= 1e-6 * np.abs(own).max()
+        return used if used.any() and is_used else None
 
     def read_compensation(self) -> FloatArray:
         """Return the part of the actuators' forces (nv,) that compensates gravity, which belongs to the masses."""
@@ -542,6 +596,8 @@ class StepReader:
                  int(mj.mjtObj.mjOBJ_FLEX): "flex"}  # fmt: skip
         known = {int(mj.mjtObj.mjOBJ_BODY): self.bodies, int(mj.mjtObj.mjOBJ_JOINT): self.joints}
         object_type = int(model.eq_objtype[i])
+        if kind == "joint":  # Engines that make such a model themselves may leave the type out.
+            object_type = int(mj.mjtObj.mjOBJ_JOINT)
         names = []
         for number in (int(model.eq_obj1id[i]), int(model.eq_obj2id[i])):
             if number >= 0 and object_type in known:

@@ -13,13 +13,16 @@ The record contains what the user of an engine sets, and not the numbers that an
 acceleration and a compliance R depend on the mass, on the position of the row and on its friction, so they are computed
 in `lavender.causes.mixture` from `Softness`, `ConstraintBlock.weight`, `gap` and `friction`. The force is the sum
 
-    f = -coriolis + gravity_map gravity + force + damping_force + actuator_force + integrator_force              (3)
-    H = h (damping_matrix + fluid_matrix + actuator_matrix) + h^2 stiffness_matrix + integrator_matrix           (4)
+    f = -coriolis + gravity_map gravity + force + damping_force + fluid_force + actuator_force
+        + integrator_force                                                                                       (3)
+    H = h (damping_matrix + fluid_matrix + actuator_matrix + coriolis_matrix) + h^2 stiffness_matrix
+        + integrator_matrix                                                                                      (4)
 
-where coriolis and gravity_map belong to the masses, damping_force, damping_matrix and fluid_matrix to the dampings of
+where coriolis, coriolis_matrix and gravity_map belong to the masses, the terms of damping and fluid to the dampings of
 joints, tendons and fluids, actuator_force and actuator_matrix to the actuators, and integrator_force to the integrator.
-An integrator uses some of the first four terms of H. If it uses the springs' stiffness, f has also -h stiffness_matrix
-v.
+The terms of a fluid belong to the masses, too, as they follow from inertias: with equal `fluid` of two records, they
+are those of the source of the masses. An integrator uses some of the first five terms of H. If it uses the springs'
+stiffness, f has also -h stiffness_matrix v.
 """
 
 from __future__ import annotations
@@ -229,10 +232,17 @@ class StepRecord:
         The engine's own acceleration in the constraint problem.
     moved_by : {"forces", "acceleration"}
         The part of the engine's answer that its integrator uses.
+    fluid : (k,), optional
+        Numbers that a user gives a fluid: density, viscosity, wind and shapes.
+    fluid_force : (nv,), optional, N, N m
     fluid_matrix : (nv, nv), optional
-        Minus the derivative of a fluid's forces by the velocity [N s/m, N m s]; they are part of `damping_force`.
+        Minus the derivative of the fluid's forces by the velocity [N s/m, N m s].
+    coriolis_matrix : (nv, nv), optional
+        Derivative of `coriolis` by the velocity [N s/m, N m s].
     uses_fluid : bool
         Whether the integrator is implicit in the fluid's forces.
+    uses_coriolis : (nv, nv) bool, optional
+        Entries of `coriolis_matrix` that the integrator uses: of free bodies, or all. None: none of them.
     velocity_change : (nv,), m/s, rad/s, optional
         Added by the integrator to the velocity of equation (1), such as by an implicit midpoint rule.
     reference_position : (nq,), optional
@@ -280,8 +290,12 @@ class StepRecord:
     acceleration: FloatArray | None = None
     moved_by: str = "forces"
     before_noslip: tuple[FloatArray, ...] | None = None
+    fluid: FloatArray | None = None
+    fluid_force: FloatArray | None = None
     fluid_matrix: FloatArray | None = None
+    coriolis_matrix: FloatArray | None = None
     uses_fluid: bool = False
+    uses_coriolis: np.ndarray | None = None
     velocity_change: FloatArray | None = None
     reference_position: FloatArray | None = None
     weights: Mapping[str, float | FloatArray] = field(default_factory=dict)
@@ -293,7 +307,7 @@ class StepRecord:
     @property
     def added_matrix(self) -> FloatArray:
         """H (nv, nv), the matrix that the integrator adds to M, equation (4)."""
-        return add_matrix(self, self, self, self)
+        return add_matrix(self, self, self, self, self)
 
     @property
     def smooth_force(self) -> FloatArray:
@@ -339,16 +353,30 @@ class StepRecord:
         return self.start_velocity + np.linalg.solve(self.mass + added, momentum)
 
 
+def _choose_fluid(mass: StepRecord, damping: StepRecord) -> StepRecord:
+    """Return the record that has the terms of a fluid: it makes them from inertias and from what a user sets."""
+    x, y = mass.fluid, damping.fluid
+    return mass if x is not None and y is not None and np.array_equal(x, y) else damping
+
+
 def add_matrix(
-    method: StepRecord, damping: StepRecord, actuators: StepRecord, force: StepRecord
+    mass: StepRecord,
+    force: StepRecord,
+    damping: StepRecord,
+    actuators: StepRecord,
+    method: StepRecord,
 ) -> FloatArray:
-    """Return H (nv, nv) of an integrator with the dampings, actuators and springs of other records, equation (4)."""
+    """Return H (nv, nv) of an integrator with terms of other records, equation (4)."""
     dt = method.dt
     added = method.integrator_matrix
     if method.uses_damping:
         added = added + dt * damping.damping_matrix
-    if method.uses_fluid and damping.fluid_matrix is not None:
-        added = added + dt * damping.fluid_matrix
+    fluid = _choose_fluid(mass, damping).fluid_matrix
+    if method.uses_fluid and fluid is not None:
+        added = added + dt * fluid
+    turning = method.coriolis_matrix if mass.coriolis_matrix is None else mass.coriolis_matrix
+    if method.uses_coriolis is not None and turning is not None:
+        added = added + dt * np.where(method.uses_coriolis, turning, 0.0)
     if method.uses_actuators:
         added = added + dt * actuators.actuator_matrix
     return added + dt**2 * force.stiffness_matrix if method.uses_stiffness else added
@@ -363,6 +391,9 @@ def add_forces(
 ) -> FloatArray:
     """Return the force without constraints (nv,) [N, N m] with terms of other records, equation (3)."""
     smooth = mass.gravity_map @ force.gravity - mass.coriolis + force.force
+    fluid = _choose_fluid(mass, damping).fluid_force
+    if fluid is not None:
+        smooth = smooth + fluid
     smooth = smooth + damping.damping_force + actuators.actuator_force + method.integrator_force
     if method.uses_stiffness:
         smooth = smooth - method.dt * force.stiffness_matrix @ method.velocity
@@ -488,7 +519,8 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
     order = places.astype(int)
     changed: dict[str, Any] = {}
     for name in ("velocity", "velocity_after", "coriolis", "force", "damping_force", "angular",
-                 "actuator_force", "integrator_force", "acceleration", "gravity_map", "velocity_change"):  # fmt: skip
+                 "actuator_force", "integrator_force", "acceleration", "gravity_map", "velocity_change",
+                 "fluid_force"):  # fmt: skip
         value = getattr(record, name)
         changed[name] = None if value is None else value[order]
     for name in (
@@ -498,6 +530,8 @@ def permute_velocities(record: StepRecord, order: Any, names: tuple[str, ...]) -
         "stiffness_matrix",
         "integrator_matrix",
         "fluid_matrix",
+        "coriolis_matrix",
+        "uses_coriolis",
     ):
         value = getattr(record, name)
         changed[name] = None if value is None else value[np.ix_(order, order)]

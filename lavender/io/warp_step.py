@@ -16,6 +16,8 @@ record = lavender.io.align_step(record, other)           # names and order of an
 
 from __future__ import annotations
 
+import copy
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -45,6 +47,7 @@ CONTACT_ARRAYS = (
     "pos",
     "frame",
 )
+SEPARATORS = re.compile("( of | between | and |^equality )")  # Of the names in a key.
 CONTACT_FRICTIONLESS = 5  # The smallest value of mjtConstraint of a contact.
 # [-] Rounding of float32 in R and in references, which are sums of large terms.
 FLOAT32_TOLERANCE = 1e-3
@@ -91,7 +94,12 @@ def step_from_newton_mujoco(
     before = as_array("position", to_numpy("position", position)[world], (model.nq,))
     moving = as_array("velocity", to_numpy("velocity", velocity)[world], (model.nv,))
     try:
-        return _read_warp(mj, model, data, before, moving, world, engine)
+        # The length of a step is an argument of the solver's `step`, and gravity one of newton's model.
+        option = solver.mjw_model.opt
+        stepped = copy.copy(model)
+        stepped.opt.timestep = float(option.timestep.numpy().flat[0])
+        stepped.opt.gravity[:] = option.gravity.numpy().reshape(-1, 3)[0]
+        return _read_warp(mj, stepped, data, before, moving, world, engine)
     except AttributeError as error:
         raise CapabilityError(
             f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}"
@@ -379,17 +387,16 @@ def align_step(record: StepRecord, like: StepRecord) -> StepRecord:
     if len(record.names) != len(like.names) or missing or len(set(known)) < len(known):
         raise InputError(
             f"velocities of both records do not correspond: {', '.join(missing[:3]) or 'a name'} of like has no unique "
-            "partner in the record"
+            "partner in the record (lavender.io.permute_velocities gives it other names)"
         )
     order = [known.index(name) for name in like.names]
     own = sorted({name for key in record.weights for name in _split_key(key)})
     theirs = sorted({name for key in like.weights for name in _split_key(key)})
     names = match_names(own, theirs)
-    blocks = tuple(_rename_block(x, names) for x in record.blocks)
     moved = permute_velocities(record, order, like.names)
     return replace(
         moved,
-        blocks=tuple(replace(x, jacobian=x.jacobian[:, order]) for x in blocks),
+        blocks=tuple(_rename_block(x, names) for x in moved.blocks),
         weights={_rename_key(k, names): x for k, x in record.weights.items()},
         softnesses={_rename_key(k, names): x for k, x in record.softnesses.items()},
         position=None,
@@ -406,14 +413,13 @@ def match_names(own: Sequence[str], theirs: Sequence[str]) -> dict[str, str]:
 
 
 def _split_key(key: str) -> list[str]:
-    """Return the names of a body or joint in a key of weights."""
-    return [key.rpartition(" of ")[2]]
+    """Return the names of bodies, joints or equalities in a key."""
+    return SEPARATORS.split(key)[::2]
 
 
 def _rename_key(key: str, names: Mapping[str, str]) -> str:
     """Return a key with the other engine's name."""
-    head, of, name = key.rpartition(" of ")
-    return f"{head}{of}{names.get(name, name)}"
+    return "".join(names.get(x, x) for x in SEPARATORS.split(key))
 
 
 def _rename_block(block: ConstraintBlock, names: Mapping[str, str]) -> ConstraintBlock:

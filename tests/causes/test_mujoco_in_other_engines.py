@@ -1,5 +1,6 @@
 """Readers of MJX and MuJoCo Warp on arrays of MuJoCo itself, under the engines' names: the records are MuJoCo's own."""
 
+import copy
 from types import SimpleNamespace
 
 import numpy as np
@@ -143,6 +144,22 @@ def test_step_of_mujoco_warp_is_read_as_the_step_of_mujoco(name, integrator, con
     found = lv.io.step_from_warp(model, data, position, velocity, world=1)
     assert found.precision == "float32"
     check(found, own, 1e-9)  # H of MuJoCo is the inverse of a measured inverse.
+
+
+def test_step_of_newton_has_the_length_and_the_gravity_of_its_call():
+    """newton gives them to the engine's model, and not to its copy of MuJoCo's."""
+    model, before, forward, after = read_step("gripper", "Euler", "pyramidal")
+    data = make_warp(model, forward, after)
+    option = SimpleNamespace(
+        timestep=Recorded([model.opt.timestep]), gravity=Recorded([model.opt.gravity])
+    )
+    stale = copy.copy(model)
+    stale.opt.timestep, stale.opt.gravity[:] = 0.5, 1.0
+    solver = SimpleNamespace(mjw_data=data, mj_model=stale, mjw_model=SimpleNamespace(opt=option))
+    position, velocity = ([np.full(len(x), 9.0), x] for x in (before.qpos, before.qvel))
+    found = lv.io.step_from_newton_mujoco(solver, position, velocity, world=1)
+    assert (found.dt, stale.opt.timestep) == (model.opt.timestep, 0.5)
+    check(found, lv.io.step_from_mujoco(model, before), 1e-9)
 
 
 @pytest.mark.parametrize(("call", "error", "words"), [

@@ -1,4 +1,4 @@
-"""Steps of MuJoCo 3.17 and of newton 1.8 (MuJoCo Warp), recorded from the same state of a gripper, without the engines.
+"""Steps of MuJoCo, of newton 1.8 (MuJoCo Warp) and of Genesis 1.4, recorded from equal states, without the engines.
 
 MuJoCo 3.17 gives the fingers on slide joints another inverse mass than MuJoCo Warp 4.0, and newton uses implicitfast
 whatever the file says. MuJoCo was also stepped with the inverse masses of newton, and with these and implicitfast.
@@ -111,3 +111,57 @@ def test_tumbling_box_of_genesis_follows_the_midpoint_rule():
     rest = record.velocity_after - record.own_velocity
     assert record.velocity_change is not None and np.abs(record.velocity_change[:6]).max() > 1e-5
     assert np.abs(rest[:6]).max() < 1e-13 < 1e-5 < np.abs(rest[6:]).max()
+
+
+#: Recorded velocities of an engine with ingredients of the other one: "model/engine/ingredients".
+SWITCHED_MODELS = dict(np.load(FOLDER / "switched.npz"))
+
+
+@pytest.mark.parametrize("key", SWITCHED_MODELS)
+def test_mixture_of_two_engines_equals_one_with_settings_of_the_other(key):
+    """A hand with a ball, a leg on the ground and a cart with a gear and a weld, of MuJoCo, Genesis and newton.
+
+    Genesis has MuJoCo's solref or integrator; or MuJoCo ("from ...") has the solref, the armature and inverse masses,
+    or the integrator of the other engine.
+    """
+    model, engine, exchanged = key.split("/")
+    is_first, name = engine.startswith("from "), engine.split()[-1]
+    version = {"genesis": "1.4.5", "newton": "1.8.0"}[name]
+    own = lv.io.load_step(FOLDER / f"{model}_mujoco_4.0.0.npz")
+    found = lv.compare(own, lv.io.load_step(FOLDER / f"{model}_{name}_{version}.npz"))
+    assert set(exchanged.split()) <= set(found.active)
+    bits = tuple((x in exchanged.split()) == is_first for x in found.active)
+    size = np.abs(SWITCHED_MODELS[key]).max()
+    # newton is in float32, whose rounding the bob of the cart, which weighs little, shows most.
+    tolerance = {"genesis": 1e-14, "newton": 3e-6}[name] * max(1.0, size)
+    velocity = found.mixtures[bits].velocity
+    np.testing.assert_allclose(velocity, SWITCHED_MODELS[key], rtol=0, atol=tolerance)
+    changed = (found.a if is_first else found.b).velocity_after
+    assert np.abs(SWITCHED_MODELS[key] - changed).max() > 1e2 * tolerance
+    for left in ("solver", "lost digits", "rest", "state"):
+        assert np.abs(found.parts[left].mean).max() < 4.0 * tolerance
+
+
+def test_equalities_of_other_names_are_matched_by_their_rows():
+    """newton gives equalities without names, and Genesis their gaps."""
+    own = lv.io.load_step(FOLDER / "cart_mujoco_4.0.0.npz")
+    for name in ("newton_1.8.0", "genesis_1.4.5"):
+        found = lv.compare(own, lv.io.load_step(FOLDER / f"cart_{name}.npz"))
+        assert not found.pairing.list_unmatched(0) and not found.pairing.list_unmatched(1)
+        assert "rows" not in {x.part for x in found.facts}
+        rows = found.parts.get("rows")
+        assert rows is None or np.abs(rows.changes).max() < 2e-5
+    text = str(lv.compare(own, lv.io.load_step(FOLDER / "cart_newton_1.8.0.npz")))
+    assert "compliance of equality load: 2.54 and 1.799 1/kg, with equal masses" in text
+
+
+@pytest.mark.parametrize("model", ["hand", "leg", "cart"])
+def test_recorded_mujoco_equals_the_installed_version(model):
+    pytest.importorskip("mujoco", minversion="3.3")
+    from lavender.causes.states import compare_at_states
+
+    stored = FOLDER / f"{model}_mujoco_4.0.0.npz"
+    other = FOLDER.parent / "models" / f"{model}.xml"
+    (found,) = compare_at_states(stored, other)[0].states
+    assert np.abs(found.comparison.difference).max() < 1e-13
+    assert not found.comparison.facts

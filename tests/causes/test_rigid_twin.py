@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.causes.smaller_steps import COUNT
 
 mj = pytest.importorskip("mujoco", minversion="4.0")
 
@@ -118,3 +119,68 @@ def test_lost_digits_of_forces_are_a_cause_of_their_own():
     assert "acceleration" in str(found) or abs(found.parts["lost digits"].mean[0]) < 0.1 * abs(
         found.difference[0]
     )
+
+
+FALL = """<mujoco><option timestep="0.01" gravity="0 0 -10"/><worldbody><geom type="plane" size="5 5 .1"/>
+<body pos="0 0 .101"><joint name="z" type="slide" axis="0 0 1"/><geom type="sphere" size=".1" mass="2"/></body>
+</worldbody></mujoco>"""
+DAMPED = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody>
+<body><joint name="damped" axis="0 0 1" damping=".3"/>
+<inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/></body>
+<body pos="1 0 0"><joint name="spring" axis="1 0 0" type="slide" stiffness="100"/>
+<geom type="sphere" size=".1" mass="1"/></body></worldbody></mujoco>"""
+
+
+def compare_with_smaller_steps(xml, velocity):
+    """Return the comparison of a step, and what the engine itself does in the smaller steps."""
+    model = mj.MjModel.from_xml_string(xml)
+    data = mj.MjData(model)
+    data.qvel[:] = velocity
+    found = lv.compare(lv.io.step_from_mujoco(model, data), simulation=(model, data))
+    np.testing.assert_array_equal(data.qvel, velocity)
+    model.opt.timestep /= COUNT
+    for _ in range(COUNT):
+        mj.mj_step(model, data)
+    np.testing.assert_allclose(
+        sum(p.mean for p in found.parts.values()), found.difference, rtol=0, atol=1e-14
+    )
+    own = found.b.velocity_after - data.qvel
+    np.testing.assert_allclose(found.parts["time step"].alone_in_b, own, rtol=0, atol=1e-15)
+    return found
+
+
+def test_impact_that_one_step_misses_is_the_time_step():
+    """A ball 1 mm above the floor falls at 1 m/s: it lands within the step of 10 ms, which has no contact."""
+    found = compare_with_smaller_steps(FALL, [-1.0])
+    assert found.b.n_rows == 0
+    assert found.parts["time step"].mean[0] == pytest.approx(-1.1, abs=TWIN_TOLERANCE)
+    assert found.list_causes(np.ones(1)) == ["time step"]
+    assert found.proposals[0].text == "timestep=0.000625"
+
+
+def test_time_step_of_damping_and_spring_has_closed_forms():
+    """Implicit Euler divides by 1 + h d / I; semi-implicit Euler of a spring has a matrix of determinant 1."""
+    found = compare_with_smaller_steps(DAMPED, [2.0, 3.0])
+    h, k, rate = 0.02, 100.0, 0.3 / 0.1
+
+    def advance(h):
+        return np.array([[1.0 - h * h * k, h], [-h * k, 1.0]])
+
+    spring = [np.linalg.matrix_power(advance(h / n), n)[1, 1] * 3.0 for n in (1, COUNT)]
+    damped = [2.0 / (1.0 + h * rate / n) ** n for n in (1, COUNT)]
+    expected = [damped[0] - damped[1], spring[0] - spring[1]]
+    np.testing.assert_allclose(found.parts["time step"].mean, expected, rtol=0, atol=1e-12)
+    exact = np.array([2.0 * np.exp(-h * rate), 3.0 * np.cos(10.0 * h)])
+    left = np.abs(found.a.velocity_after - exact) / np.abs(found.b.velocity_after - exact)
+    assert (left < 1.2 / COUNT).all()  # Both methods have the first order.
+
+
+def test_simulation_of_another_state_or_of_two_records_is_refused():
+    model = mj.MjModel.from_xml_string(FALL)
+    data = mj.MjData(model)
+    record = lv.io.step_from_mujoco(model, data)
+    with pytest.raises(lv.InputError, match="two records"):
+        lv.compare(record, record, simulation=(model, data))
+    data.qvel[0] = 0.5
+    with pytest.raises(lv.InputError, match="another state"):
+        lv.compare(record, simulation=(model, data))

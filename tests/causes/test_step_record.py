@@ -525,3 +525,25 @@ def test_shortest_time_of_a_solref_belongs_to_the_integrator(cone, solref):
     found = lv.compare(*pair)
     others = [p.mean for name, p in found.parts.items() if name != "integrator"]
     assert np.abs(found.difference).max() > 1e-3 and np.abs(others).max() < 1e-9
+
+
+SLIDER = """<mujoco><option timestep="0.01" gravity="{pull} 0 0"/><worldbody><body>
+<joint name="x" type="slide" axis="1 0 0" frictionloss="{loss}"/><geom type="sphere" size=".1" mass="1"/>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("pull", "total"), [(-1.0, -0.02), (1.0, 0.0)])
+def test_two_equal_causes_are_both_named_and_cancelling_ones_are_said(pull, total):
+    """1 N more dry friction, which a sliding body feels in full, and 1 N of weight on 1 kg: 0.01 m/s each in a step."""
+    a, b = (
+        read_text(SLIDER.format(pull=x, loss=y), lambda model, data: data.qvel.fill(5.0))
+        for x, y in ((0.0, 1.0), (pull, 2.0))
+    )
+    found = lv.compare(a, b)
+    assert found.difference[0] == pytest.approx(total, abs=1e-14)
+    assert found.parts["friction"].mean[0] == pytest.approx(-0.01, abs=1e-14)
+    assert found.parts["force"].mean[0] == pytest.approx(0.01 * pull, abs=1e-14)
+    if total:
+        assert set(found.list_causes(np.ones(1))) == {"force", "friction"}
+    else:
+        assert "they cancel" in str(found)

@@ -36,10 +36,13 @@ def test_compare_with_an_option_changes_a_copy_of_the_model(lavender, models):
     assert "friction" in output and "cone of" in output
 
 
-def test_compare_of_one_model_compares_with_the_rigid_laws(lavender, models):
-    code, output, error = lavender("compare", models / "stiff.xml", "--steps", 40)
+def test_compare_of_one_model_compares_with_the_rigid_laws_in_smaller_steps(lavender, models):
+    page = models / "page"
+    code, output, error = lavender("compare", models / "stiff.xml", "--steps", 40, "--out", page)
     assert code == 0, error
-    assert "against the rigid laws" in output
+    assert "against the rigid laws in 16 smaller steps" in output
+    (state,) = json.loads((page / "numbers.json").read_text(encoding="utf-8"))["states"]
+    assert {"mean", "alone_in_a", "alone_in_b"} <= set(state["parts"]["time step"])
 
 
 def test_compare_writes_a_page_with_a_picture_and_all_numbers(lavender, models):
