@@ -6,72 +6,78 @@ import numpy as np
 import pytest
 from hypothesis import given
 from random_problems import CONTACTS, random_contact_problem, seeds
+from units import UNITS
 
 import lavender as lv
 
-LENGTH = 8.0  # Lengths are measured in a unit that is smaller by this factor; a power of two, so that nothing rounds.
 
-
-def scale_lengths(problem):
-    """Return a problem of bodies in the smaller unit of length, and the factor of the unit of each impulse (m,)."""
-    rows = problem.rows
-    angular = problem.angular_rows
-    split = len(problem.rows.jac)
-    jac = rows.jac.reshape(-1, 4, 3).copy()
-    jac[:, 1::2] *= np.where(angular[:split], 1.0, LENGTH)[:, None, None]
-    velocity = rows.v_free.copy()
-    velocity[:, :3] *= LENGTH
-    scaled = replace(
-        rows,
-        jac=jac.reshape(-1, 12),
-        v_free=velocity,
-        arm_a=LENGTH * rows.arm_a,
-        arm_b=LENGTH * rows.arm_b,
-        inv_inertia=rows.inv_inertia / LENGTH**2,
-    )
-    cones = problem.cones
-    has_patch = cones.spin_rows >= 0  # For boxes and ellipses this number is a ratio without unit.
-    factor = np.where(angular, LENGTH**2, LENGTH)
-    cones = replace(
-        cones,
-        patch_radius=np.where(has_patch, LENGTH, 1.0) * cones.patch_radius,
-        rolling=LENGTH * cones.rolling,
-        lower=factor * cones.lower,
-        upper=factor * cones.upper,
-    )
-    return replace(
-        problem,
-        rows=scaled,
-        cones=cones,
-        b=np.where(angular, 1.0, LENGTH) * problem.b,
-        guess=None,
-        compliance=problem.compliance / np.where(angular, LENGTH**2, 1.0),
-    ), factor
-
-
+@pytest.mark.parametrize("units", UNITS.values(), ids=UNITS)
 @pytest.mark.parametrize("kind", sorted(CONTACTS))
 @given(seed=seeds)
-def test_velocity_errors_change_with_the_unit_of_length_as_their_units_say(kind, seed):
+def test_every_error_changes_with_the_units_as_its_own_unit_says(kind, units, seed):
     problem = CONTACTS[kind](seed)
-    impulse = np.random.default_rng(seed).normal(size=problem.m)
-    scaled, factor = scale_lengths(problem)
-    relative = lv.residual(scaled, factor * impulse).relative
-    assert relative == pytest.approx(lv.residual(problem, impulse).relative, rel=1e-9)
-    if (
-        kind != "ellipses"
-    ):  # One body that only turns: the error of its angular rows is not converted.
+    # One body that only turns: the error of its angular rows is not converted, so that no unit of length is common.
+    if is_mixed := kind != "ellipses" and seed % 2 == 1:
         inv_mass = problem.rows.inv_mass.copy()
         inv_mass[problem.rows.joint_body[0]] = 0.0
         problem = replace(problem, rows=replace(problem.rows, inv_mass=inv_mass))
-    scaled, factor = scale_lengths(problem)
+    impulse = np.random.default_rng(seed).normal(size=problem.m)
+    scaled, factor = units.scale(problem)
     before = lv.residual(problem, impulse)
     after = lv.residual(scaled, factor * impulse)
-    units = np.array([problem.row_unit(i) for i in range(problem.m)])
-    expected = np.where(units == "m/s", LENGTH, 1.0) * before.velocity_by_row
+    if not is_mixed:
+        assert after.relative == pytest.approx(before.relative, rel=1e-9)
+    for name in ("energy", "energy_at_zero", "floor_energy"):
+        expected = units.factor("sqrt(J)") * getattr(before, name)
+        assert getattr(after, name) == pytest.approx(expected, rel=1e-9), name
+    named = [problem.row_unit(i) for i in range(problem.m)]
+    assert [scaled.row_unit(i) for i in range(problem.m)] == named
+    speed = np.array([units.factor(unit) for unit in named])
     # Rounding of a row's own terms: sums with mixed units round differently.
-    np.testing.assert_allclose(
-        after.velocity_by_row, expected, rtol=1e-9, atol=1e-12 * expected.max()
+    for name in ("velocity_by_row", "slack"):
+        expected = getattr(before, name) * (
+            speed
+            if name == "velocity_by_row"
+            else np.where(problem.angular_rows, units.factor("rad/s"), units.factor("m/s"))
+        )
+        np.testing.assert_allclose(
+            getattr(after, name), expected, rtol=1e-9, atol=1e-12 * abs(expected).max()
+        )
+
+
+@pytest.mark.parametrize("units", UNITS.values(), ids=UNITS)
+@pytest.mark.parametrize("kind", ["rolling and spin", "boxes"])
+def test_motion_errors_and_forces_change_with_the_units_as_their_own_unit_says(kind, units):
+    problem = CONTACTS[kind](4)
+    impulse = np.random.default_rng(4).normal(size=problem.m)
+    reference = lv.solve(problem, tol=1e-12).impulse
+    scaled, factor = units.scale(problem)
+    before = lv.motion_error(problem, impulse, reference)
+    after = lv.motion_error(scaled, factor * impulse, factor * reference)
+    for name, unit in (("kinetic", "sqrt(J)"), ("energy", "sqrt(J)"), ("speed", "m/s"), ("spin", "rad/s")):  # fmt: skip
+        expected = units.factor(unit) * getattr(before, name)
+        assert getattr(after, name) == pytest.approx(expected, rel=1e-9), name
+    dt = 0.01
+    force = lv.contact_forces(problem, impulse, dt=dt, reference=reference)
+    other = lv.contact_forces(
+        scaled, factor * impulse, dt=units.time * dt, reference=factor * reference
     )
+    for name in ("normal", "tangential"):
+        expected = units.factor("N") * np.asarray(getattr(force, name))
+        size = np.nanmax(abs(expected))
+        np.testing.assert_allclose(getattr(other, name), expected, rtol=1e-9, atol=1e-12 * size)
+
+
+@pytest.mark.parametrize("units", UNITS.values(), ids=UNITS)
+@pytest.mark.parametrize("solver", ["pgs", "sequential_impulses", "jacobi", "newton", "auto"])
+def test_solver_takes_the_same_iterations_in_other_units(solver, units):
+    problem = CONTACTS["rolling and spin"](4)
+    scaled, factor = units.scale(problem)
+    before = lv.solve(problem, solver, max_iter=30)
+    after = lv.solve(scaled, solver, max_iter=30)
+    assert (after.iterations, after.status) == (before.iterations, before.status)
+    expected = factor * before.impulse
+    np.testing.assert_allclose(after.impulse, expected, rtol=1e-6, atol=1e-9 * abs(expected).max())
 
 
 @given(seed=seeds)

@@ -4,6 +4,7 @@
 impulse. A keyword that one of them ignores, or whose default differs, makes that door's answer another one.
 """
 
+import inspect
 import json
 
 import numpy as np
@@ -24,6 +25,7 @@ from lavender.io.recorder import describe_answer
 from lavender.report.cases import resolve_item
 from lavender.report.store import make_lines
 from lavender.report.tables import read_engine_answers
+from lavender.solving.prepared import Prepared
 
 # -- solves ------------------------------------------------------------------------------------------------------------
 
@@ -124,6 +126,26 @@ def test_history_and_callback_are_the_same_through_every_door(solver):
         columns = (history.iterations, history.relative, history.energy, history.velocity)
         found.append((seen, [x.tolist() for x in columns]))
     assert found[0] == found[1] == found[2] and len(found[0][0]) > 1
+
+
+#: Keywords of doors that a test of this file gives them; the others choose the solver, problem or worlds.
+TESTED = {name for _, name, _ in KEYWORDS} | {"history", "callback", "precision", "threshold"}
+OTHERS = {"solver", "problem", "b", "v_free", "errors", "threads", "like", "impulses"}
+DOORS = (lv.solve, lv.solve_many, Prepared.solve,
+         lv.residual, lv.residual_many)  # fmt: skip
+
+
+@pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__qualname__)
+def test_every_keyword_of_a_door_is_tested_and_has_the_default_of_the_others(door):
+    defaults = {}
+    for other in DOORS:
+        for name, keyword in inspect.signature(other).parameters.items():
+            if keyword.default is not inspect.Parameter.empty:
+                defaults.setdefault(name, keyword.default)
+    for name, keyword in inspect.signature(door).parameters.items():
+        if keyword.default is not inspect.Parameter.empty:
+            assert keyword.default == defaults[name], name
+            assert name in TESTED | OTHERS, f"{name}: add a line to KEYWORDS"
 
 
 # -- programs ----------------------------------------------------------------------------------------------------------
