@@ -17,6 +17,7 @@ record = lavender.io.align_step(record, other)           # names and order of an
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -91,6 +92,9 @@ def step_from_newton_mujoco(
     before = as_array("position", to_numpy("position", position)[world], (model.nq,))
     moving = as_array("velocity", to_numpy("velocity", velocity)[world], (model.nv,))
     try:
+        steps = solver.mjw_model.opt.timestep.numpy()
+        model = copy(model)  # The solver gives the time step of a call to Warp's model alone.
+        model.opt.timestep = steps[world % len(steps)]
         return _read_warp(mj, model, data, before, moving, world, engine)
     except AttributeError as error:
         raise CapabilityError(

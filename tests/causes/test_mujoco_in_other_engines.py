@@ -145,6 +145,18 @@ def test_step_of_mujoco_warp_is_read_as_the_step_of_mujoco(name, integrator, con
     check(found, own, 1e-9)  # H of MuJoCo is the inverse of a measured inverse.
 
 
+def test_step_of_newton_has_the_time_step_of_its_call():
+    model, before, forward, after = read_step("sliding", "Euler", "pyramidal")
+    dt = model.opt.timestep
+    warp = SimpleNamespace(opt=SimpleNamespace(timestep=Recorded(np.array([dt]))))
+    data = make_warp(model, forward, after)
+    model.opt.timestep = 3.0 * dt  # newton's model keeps the one that it was built with.
+    solver = SimpleNamespace(mj_model=model, mjw_model=warp, mjw_data=data)
+    position, velocity = ([np.full(len(x), 9.0), x] for x in (before.qpos, before.qvel))
+    found = lv.io.step_from_newton_mujoco(solver, position, velocity, world=1)
+    assert found.dt == dt and model.opt.timestep == 3.0 * dt
+
+
 @pytest.mark.parametrize(("call", "error", "words"), [
     (lambda m, b, a, w: lv.io.step_from_mjx(1, b, a), lv.InputError, "mujoco.MjModel"),
     (lambda m, b, a, w: lv.io.step_from_mjx(m, SimpleNamespace(qpos=b.qpos[None], qvel=b.qvel), a),
