@@ -86,6 +86,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     settings = {k: v for k, v in options.items() if k not in own}
     if kind == "SolverXPBD" and scene["restitution"]:
         settings["enable_restitution"] = True
+    if kind == "SolverMuJoCo":  # Memory: more rows and contacts than any scene has, stored densely.
+        settings |= {"njmax": 500, "nconmax": 120, "jacobian": "dense"}
     solvers = [solver_class(model, **settings)]
     states, control = [model.state(), model.state()], model.control()
     contacts = None if kind == "SolverMuJoCo" else model.contacts()
