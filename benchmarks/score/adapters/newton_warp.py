@@ -174,7 +174,8 @@ def get_arrays(state: Any) -> list[Any]:
 def check(scene: tools.Scene, kind: str, tree: list[tools.Link]) -> None:
     """Raise CannotExpress if a solver has no means for a scene."""
     if scene["restitution"] and kind not in ("SolverXPBD", "SolverKamino"):
-        raise tools.CannotExpress("no restitution coefficient")
+        only = ", only the damping ratio of a soft contact" if kind == "SolverMuJoCo" else ""
+        raise tools.CannotExpress(f"no restitution coefficient{only}")
     if kind == "SolverFeatherstone" and any(link.loops for link in tree):
         raise tools.CannotExpress("no loops")
 
