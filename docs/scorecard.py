@@ -394,8 +394,16 @@ def make_limits(rows):
         row = find(rows, name, COLUMNS[0], "bounce")
         if row and row.note.startswith("cannot: no "):
             why.setdefault(row.note.removeprefix("cannot: "), []).append(name)
+    without = set().union(*why.values())
+
+    def shorten(name):
+        """Return the title of an engine, or of a row if another row of the engine bounces."""
+        others = {other for other in names if ENGINES[other].engine == ENGINES[name].engine}
+        title = ENGINES[name].title
+        return title.split(" (")[0] if others <= without else title
+
     engines = [
-        (sorted({ENGINES[name].title.split(" (")[0] for name in same}), reason.split(", ")[-1])
+        (sorted({shorten(name) for name in same}), reason.split(", ")[-1])
         for reason, same in why.items()
     ]
     bounce = "; ".join(f"{', '.join(titles)}: {reason}" for titles, reason in engines)

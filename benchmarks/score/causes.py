@@ -47,8 +47,6 @@ ROWS = (
     "mujoco-exact",
     "mujoco-pgs",
     "mjx",
-    "newton-mujoco",
-    "genesis",
 )
 ACCURATE_ONLY = ("mujoco-noslip", "mujoco-soft", "mujoco-exact")
 N_SAMPLES = 40  # steps of a simulation that are divided

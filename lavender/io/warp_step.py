@@ -97,8 +97,9 @@ def step_from_newton_mujoco(
         # The length of a step is an argument of the solver's `step`, and gravity one of newton's model.
         option = solver.mjw_model.opt
         stepped = copy.copy(model)
-        stepped.opt.timestep = float(option.timestep.numpy().flat[0])
-        stepped.opt.gravity[:] = option.gravity.numpy().reshape(-1, 3)[0]
+        steps, gravity = option.timestep.numpy().ravel(), option.gravity.numpy().reshape(-1, 3)
+        stepped.opt.timestep = float(steps[world % len(steps)])
+        stepped.opt.gravity[:] = gravity[world % len(gravity)]
         return _read_warp(mj, stepped, data, before, moving, world, engine)
     except AttributeError as error:
         raise CapabilityError(

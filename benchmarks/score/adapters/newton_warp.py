@@ -86,6 +86,8 @@ def build(scene: tools.Scene, options: tools.Options) -> tools.Running:
     settings = {k: v for k, v in options.items() if k not in own}
     if kind == "SolverXPBD" and scene["restitution"]:
         settings["enable_restitution"] = True
+    if kind == "SolverMuJoCo":  # Memory: more rows and contacts than any scene has, stored densely.
+        settings |= {"njmax": 500, "nconmax": 120, "jacobian": "dense"}
     solvers = [solver_class(model, **settings)]
     states, control = [model.state(), model.state()], model.control()
     contacts = None if kind == "SolverMuJoCo" else model.contacts()
@@ -172,7 +174,8 @@ def get_arrays(state: Any) -> list[Any]:
 def check(scene: tools.Scene, kind: str, tree: list[tools.Link]) -> None:
     """Raise CannotExpress if a solver has no means for a scene."""
     if scene["restitution"] and kind not in ("SolverXPBD", "SolverKamino"):
-        raise tools.CannotExpress("no restitution coefficient")
+        only = ", only the damping ratio of a soft contact" if kind == "SolverMuJoCo" else ""
+        raise tools.CannotExpress(f"no restitution coefficient{only}")
     if kind == "SolverFeatherstone" and any(link.loops for link in tree):
         raise tools.CannotExpress("no loops")
 
