@@ -57,9 +57,10 @@ FAR_SIDE = 1e6
 DEFINITE_SHIFTS = 1e-7, 1e-5
 # [-] A claim "infeasible" with a larger error of its proof is followed by a second call.
 MAX_CLAIM_ERROR = 1e-3
-# The matrix of a step of k equations counts as sparse with at most this multiple of k^3 entries. At k = 292 to 380, the
-# sparse and the dense factorisation take the same time if 1.5 to 2.5 % of the k^2 entries are not zero.
-MAX_SPARSE_ENTRIES = 5e-5
+# The matrix of a step of k equations is factored as sparse with at most MAX_SPARSE_GROWTH k^3 and MAX_SPARSE_SHARE k^2
+# entries. Matrices of public programs (k = 150 to 550) then take no longer than dense on one thread, random patterns up
+# to 5 times as long. On a busy machine, the threads of a dense factorisation may take 100 times as long.
+MAX_SPARSE_GROWTH, MAX_SPARSE_SHARE = 1.5e-4, 0.08
 MAX_FIT_SIZE = 300  # Largest number of variables and of active rows for `fit_multipliers`.
 NEAR_SLACK = (
     1e-8  # [-] Rows with a smaller slack in scaled units may be active with a multiplier of 0.
@@ -284,7 +285,8 @@ class ConvexProgram:
             return None
         if size:
             try:
-                is_dense = step.count_entries() > MAX_SPARSE_ENTRIES * size**3
+                share = min(MAX_SPARSE_GROWTH * size, MAX_SPARSE_SHARE)
+                is_dense = step.count_entries() > share * size**2
                 solve, refinements = (_factor_dense if is_dense else _factor_sparse)(step)
             except RuntimeError:  # The sparse matrix is singular in spite of its shift.
                 return None
