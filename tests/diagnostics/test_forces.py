@@ -55,6 +55,55 @@ def test_forces_of_three_feet_are_determined_and_share_the_load():
     np.testing.assert_allclose(forces.normal, 0.9 * forces.exact, rtol=1e-12)
 
 
+def test_tables_of_forces_are_sums_over_the_contacts_of_each_pair():
+    """Brute force over the contacts of two tables beside each other, each on four feet."""
+    builder = lv.RowBuilder(
+        [0.1, 0.05],
+        np.multiply.outer([10.0, 10.0], np.eye(3)),
+        np.array([[0.0, 0.0, -9.81 * DT, 0.0, 0.0, 0.0]] * 2),
+        DT,
+        np.array([[0.0, 0.0, 0.5], [9.0, 0.0, 0.5]]),
+    )
+    for body, away in ((0, 0.0), (1, 9.0)):
+        for x, y in FOUR:
+            builder.contact(-1, body, (x + away, y, 0.0), (0.0, 0.0, 1.0), mu=0.0)
+    problem = builder.problem("coulomb")
+    impulse = np.arange(1.0, 1.0 + problem.m)
+    forces = lv.contact_forces(problem, impulse, dt=DT)
+    assert set(forces.determined) == {"pair"}
+    pairs = np.array(forces.pairs)
+    for row in forces.table.to_dict("records"):
+        own = pairs == row["bodies"]
+        assert row["contact"] == "4 contacts" and own.sum() == 4
+        assert row["normal force [N]"] == pytest.approx(forces.normal[own].sum())
+        assert row["exact normal force [N]"] == pytest.approx(forces.exact[own].sum())
+    assert len(forces.table) == 2
+    for k, row in enumerate(forces.by_contact.to_dict("records")):
+        own = pairs == pairs[k]
+        total, exact = forces.normal[own].sum(), forces.exact[own].sum()
+        assert row["pair force [N]"] == pytest.approx(total)
+        assert row["pair error [N]"] == pytest.approx(abs(total - exact))
+
+
+@pytest.mark.parametrize(
+    "friction", [None, lambda name: (0.4, 0.8)], ids=["rows", "scaled tangents"]
+)
+def test_friction_force_and_its_error_are_vectors(friction):
+    """A box that slides on one point: friction is determined, and friction in the wrong direction has an error."""
+    rng = np.random.default_rng(0)
+    jac = np.eye(3)
+    cones = lv.Cones.contacts(0.5)
+    problem = lv.Problem.from_jacobian(jac, np.eye(3), [-1.0, 2.0, 3.0], cones=cones)
+    exact = lv.solve(problem, tol=1e-13).impulse
+    impulse = exact * [1.0, *rng.choice([-1.0, 1.0], 2)]
+    impulse[1] *= -1.0
+    forces = lv.contact_forces(problem, impulse, dt=DT, reference=exact, friction=friction)
+    assert forces.determined == ("contact",)
+    scale = np.array([1.0, 1.0 if friction is None else 2.0]) / DT
+    assert forces.tangential[0] == pytest.approx(np.linalg.norm(scale * impulse[1:]))
+    assert forces.error[0] == pytest.approx(np.linalg.norm(scale * (impulse - exact)[1:]))
+
+
 def test_two_bodies_between_which_a_load_is_not_determined_have_no_number():
     """A beam on two fixed bodies and a third in between: no pair's force is determined."""
     builder = lv.RowBuilder(

@@ -41,6 +41,11 @@ def test_motion_error_is_the_energy_and_the_largest_speeds_of_the_velocity_diffe
     assert e.rows == pytest.approx(np.abs(p.slack(x) - p.slack(e.reference)).max(), rel=1e-9)
     assert e.energy == pytest.approx(np.sqrt(0.5 * delta @ p.dense() @ delta), rel=1e-9)
     assert e.kinetic <= e.energy * (1 + 1e-12)
+    unit = "rad/s" if p.angular_rows[e.row] else "m/s"
+    assert f"rows {e.rows:.2g} {unit} ({e.row_name})" in str(e)
+    own = p.compute_velocity_change(e.reference).ravel()
+    size = np.sqrt(0.5 * own @ mass @ own)  # Without the energy in compliance, as `kinetic`.
+    assert e.relative is None or e.relative == pytest.approx(e.kinetic / size, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -223,14 +223,19 @@ def test_diagnose_of_a_bounce_with_a_gap_reports_nothing():
     gap = np.array([0.01, 0.02])  # m, closed within the step
 
     def found(target):
-        cones = lv.Cones.contacts(0.0, tangents=0, count=2)
+        n = len(fall)
+        cones = lv.Cones.contacts(0.0, tangents=0, count=n)
         problem = lv.Problem.from_jacobian(
-            np.eye(2), np.eye(2), fall - 9.81 * dt, target=target, cones=cones
+            np.eye(n), np.eye(n), fall - 9.81 * dt, target=target, cones=cones
         )
         return [s.kind for s in lv.diagnose(problem, velocity=fall, gap=gap, dt=dt)]
 
     assert found(-e * fall) == []
     assert found(gap / dt) == ["targets"]
+    # Bounces of few among contacts that only close their gaps.
+    fall = np.append(fall, np.full(5, -0.2))
+    gap = np.append(gap, np.full(5, 0.001))
+    assert found(np.append(-e * fall[:2], -gap[2:] / dt)) == []
 
 
 def pressed(law, form):

@@ -76,6 +76,11 @@ def test_fclib_local_file_keeps_every_bit(tmp_path, spacedim, suffix):
         assert file["guesses/number_of_guesses"][()].tolist() == [1]
         assert np.array_equal(file["guesses/1/r"][()], problem.guess)
         assert np.array_equal(file["solution/r"][()], impulse)
+    with h5py.File(path, "r+") as file:  # Of several guesses the first is the problem's.
+        file.copy("guesses/1", "guesses/2")
+        file["guesses/2/r"][...] = 2.0 * problem.guess
+        file["guesses/number_of_guesses"][...] = 2
+    assert lv.load(path).guess.tobytes() == problem.guess.tobytes()
 
 
 @given(seeds, st.sampled_from([2, 3, 5]))

@@ -163,6 +163,25 @@ def test_backend_dual_fulfils_the_kkt_conditions(name, form):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("seed", range(12))
+def test_multipliers_of_inequalities_are_a_proof(name, seed):
+    """They are at least 0, and 0 exactly where the inequality is far from active, whatever the backend returned."""
+    rng = np.random.default_rng(seed)
+    n = 6
+    half = rng.normal(size=(n, n))
+    rows, limit = rng.normal(size=(8, n)), rng.uniform(0.1, 1.0, 8)
+    ends = np.full(n, 1.0)
+    try:
+        answer = lv.solve_qp(
+            half @ half.T + 0.1 * np.eye(n), rng.normal(size=n), rows, limit, lb=-ends, ub=ends, solver=name, tol=1e-6
+        )  # fmt: skip
+    except (lv.SolverUnavailable, lv.CapabilityError) as error:
+        pytest.skip(str(error))
+    assert answer.found and answer.z.min() >= 0.0
+    assert not answer.z[limit - rows @ answer.x > 1e-3].any()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
 def test_backend_uses_a_start_if_its_spec_says_so(name):
     problem = lv.Problem.lcp(*spd(40, seed=5))
     cold = lv.solve(problem, name, tol=1e-6)

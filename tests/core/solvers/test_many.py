@@ -335,6 +335,19 @@ def test_first_numbers_of_a_world_are_read_from_the_arrays(monkeypatch):
     assert found[1].worst_name == batch[1].row_name(found.worst_row[1])
 
 
+def test_each_column_of_a_table_of_worlds_is_that_number_of_each_world():
+    many = lv.solve_many(lv.Batch(*worlds(3), cones=DISKS), "pgs", max_iter=3)
+    table = many.to_pandas()
+    for i, row in table.iterrows():
+        one = many[i].residual
+        assert (row.relative, row.energy) == (one.relative, one.energy)
+        assert row.roundoff_floor == one.roundoff_floor
+        assert row.velocity_error == pytest.approx(one.velocity, rel=1e-12)
+        assert row.impulse_error == pytest.approx(abs(one.error[one.worst_row]), rel=1e-12)
+        assert (row.status, row.iterations) == (many[i].status.name, many[i].iterations)
+        assert row.worst_row == one.worst_name
+
+
 def test_batch_reads_its_arrays_at_each_solve():
     wide = np.zeros((2, 14, 20))
     jac, mass, free = worlds(2)
