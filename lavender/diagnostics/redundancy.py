@@ -31,6 +31,7 @@ MAX_BASIS_NUMBERS = (
 CHUNK_ROWS = 64  # Number of rows that one matrix product makes orthogonal to the rows before them.
 # An island has full rank if 1 / |A^-1| exceeds this and 1e3 tol^2, with A scaled to 1.
 MIN_INVERSE_NORM = 1e-9
+INVERSE_STEPS = 2  # Pairs of steps of inverse iteration, with A and its transpose.
 # Rows with smaller new parts wait until all rows with larger ones are in the basis, so that rounding is not amplified.
 MIN_PARTS = (1e-2, 1e-5, 0.0)
 # A row with relative entries of up to this in random null vectors is not moved by them.
@@ -149,9 +150,11 @@ def _scale_rows(rows: sp.csr_array, is_delassus: bool) -> sp.csr_array:
 
 
 def _has_full_rank(rows: sp.csr_array, is_delassus: bool, tol: float) -> bool:
-    """Return whether a sparse factorisation proves that no row depends on others; False if it does not."""
-    from scipy.sparse.linalg import LinearOperator, onenormest
+    """Return whether a sparse factorisation proves that no row depends on others; False if it does not.
 
+    Inverse iteration from random vectors estimates |A^-1|. SciPy's `onenormest` is not used: its start is of +1 and -1
+    from NumPy's global generator, and it misses a null vector that is orthogonal to it.
+    """
     m = rows.shape[0]
     if not 0 < m <= rows.shape[1]:
         return False
@@ -160,8 +163,13 @@ def _has_full_rank(rows: sp.csr_array, is_delassus: bool, tol: float) -> bool:
         factor = factor_sparse_lu(sp.csc_array(matrix))
     except RuntimeError:  # A pivot is 0.
         return False
-    inverse = LinearOperator((m, m), matvec=factor.solve, rmatvec=lambda x: factor.solve(x, "T"))
-    return bool(max(MIN_INVERSE_NORM, 1e3 * tol**2) * onenormest(inverse) < 1.0)
+    x = np.random.default_rng(0).normal(size=(m, 2))
+    size = np.zeros(2)
+    with np.errstate(all="ignore"):
+        for trans in ("N", "T") * INVERSE_STEPS:
+            x = factor.solve(x / np.linalg.norm(x, axis=0), trans)
+            size = np.linalg.norm(x, axis=0)
+    return bool(max(MIN_INVERSE_NORM, 1e3 * tol**2) * size.max() < 1.0)
 
 
 def _decompose_rows(

@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lavender.base.arrays import FloatArray, IntArray, check_int
 from lavender.base.errors import CapabilityError, InputError
@@ -419,6 +418,8 @@ class GenesisReader:
                 for x in pair for j in self.solver.joints if int(j.idx) == x
             )  # fmt: skip
             return np.array([first - np.polynomial.polynomial.polyval(sum(others), data[:5])])
+        from scipy.spatial.transform import Rotation
+
         positions, turns = self.poses
         frames = [Rotation.from_quat(turns[x][[1, 2, 3, 0]]) for x in pair]
         anchors = data[:6].reshape(2, 3)

@@ -25,6 +25,13 @@ def draw_redundant(seed):
     return lv.Problem.from_jacobian(jac, np.eye(nv), rng.standard_normal(nv), cones=cones), jac
 
 
+def test_the_rank_does_not_depend_on_the_global_random_numbers():
+    """SciPy's estimate of a norm draws its start from them: one call in four missed the null vector of seed 0."""
+    problem, jac = draw_redundant(0)
+    for _ in range(40):
+        assert lv.redundancy(problem).rank == np.linalg.matrix_rank(jac, tol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_redundant_rows_and_blocks_are_those_of_brute_force(seed):
     problem, jac = draw_redundant(seed)
