@@ -191,7 +191,9 @@ def format_next_command(audit: Any, limit: float) -> str:
     runs = audit.runs
     words = ["lavender", "tune", runs.source, "--max-velocity-error", f"{limit:g}"]
     words += ["--states", str(audit.folder / "states.npz")]
-    if runs.control_name not in ("", "random"):
+    if runs.control_name == "random" and runs.seed:
+        words += ["--seed", str(runs.seed)]
+    elif runs.control_name not in ("", "random"):
         words += ["--controls", runs.control_name]
     return shlex.join(words)
 

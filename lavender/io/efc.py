@@ -351,9 +351,14 @@ def from_mujoco_many(
             "and in the simulation: model.opt.enableflags &= ~mujoco.mjtEnableBit.mjENBL_SLEEP"
         )
     check_choice("errors", errors, ERRORS)
-    values = np.ascontiguousarray(
-        as_array("states", states, (None, None), finite=errors == "raise")
-    )
+    try:
+        checked = as_array("states", states, (None, None), finite=errors == "raise")
+    except InputError as error:
+        full = mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION)
+        raise InputError(
+            f"{error}; each row is a state of mj_getState, best mjSTATE_INTEGRATION with {full} numbers"
+        ) from None
+    values = np.ascontiguousarray(checked)
     size = values.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}
     for kind in (mj.mjtState.mjSTATE_FULLPHYSICS, mj.mjtState.mjSTATE_INTEGRATION):

@@ -120,6 +120,8 @@ def _solve_after_call(
     problem: Problem, spec: SolverSpec, impulse: Any, tol: float, counts: Any
 ) -> Solution:
     """Solve a problem that the compiled call with these work counts did not solve."""
+    if spec.requires:
+        get(spec.name)  # Raises SolverUnavailable if a package of a registered solver is missing.
     prepared = Prepared(problem, spec, {}, False)
     return prepared._solve(problem, impulse, *check_arguments(spec, tol, None), failed_call=counts)
 

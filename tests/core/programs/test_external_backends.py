@@ -491,3 +491,11 @@ def test_backend_at_tol_zero_runs_at_its_tightest_tolerance():
     solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
     assert solution.status in (lv.Status.STALLED, lv.Status.ROUNDOFF_LIMIT)
     assert solution.residual.relative <= 1e-10
+
+
+def test_a_solver_whose_package_is_missing_says_so_in_every_call():
+    problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+    for name, reason in lv.known().items():
+        for _ in range(2 if reason else 0):
+            with pytest.raises(lv.SolverUnavailable, match=f"{name}.*needs"):
+                lv.solve(problem, name)
