@@ -13,7 +13,7 @@ from lavender.causes.mixture import Mixture
 from lavender.io.step_record import StepRecord
 
 LEFT_OVER = ("state", "solver", "lost digits", "noslip", "rest")  # Parts that no mixture has.
-NEAR = 0.9  # [-] Two causes are as large as each other if one may be this part of the other.
+MIN_EQUAL_RATIO = 0.9  # [-] Two causes count as equal if their ratio may be at least this.
 # [-] A difference below this multiple of the velocities is rounding.
 ROUNDING = {"float64": 1e-10, "float32": 1e-5}
 
@@ -104,13 +104,14 @@ class Difference:
     def list_causes(self, row: FloatArray) -> list[str]:
         """Return the names of the causes of a velocity's difference, the largest first.
 
-        A second cause is named if the interval of the first one contains 0, or comes within `NEAR` of the second's.
+        A second cause is named if the interval of the first one contains 0, or comes within `MIN_EQUAL_RATIO` of the
+        second's.
         """
         ranked = [x for x in self.rank(row) if abs(x[1]) > self.rounding]
         if not ranked:
             return []
         first, largest, low, high = ranked[0]
-        smallest = 0.0 if low <= 0.0 <= high else NEAR * min(abs(low), abs(high))
+        smallest = 0.0 if low <= 0.0 <= high else MIN_EQUAL_RATIO * min(abs(low), abs(high))
         return [first.name] + [
             part.name for part, mean, low, high in ranked[1:]
             if max(abs(low), abs(high)) >= smallest and abs(mean) >= 0.1 * abs(largest)

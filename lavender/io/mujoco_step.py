@@ -294,7 +294,7 @@ class StepReader:
         return matrix
 
     def find_used_coriolis(self, rest: FloatArray, terms: FloatArray) -> np.ndarray | None:
-        """Return the entries of the Coriolis terms (nv, nv) that the rest of H has: all, or those of free bodies."""
+        """Return which entries (nv, nv) of H contain Coriolis terms: all, or only those of free bodies."""
         kinds, model = self.mj.mjtIntegrator, self.model
         kind = int(model.opt.integrator)
         used = np.full((self.nv, self.nv), kind == int(kinds.mjINT_IMPLICIT))

@@ -216,7 +216,7 @@ def check_arrays(many, batch):
 
 
 def solve_list(worlds, starts, **options):
-    """Return solutions of a list that has problems of another law, without starts, between those of the worlds."""
+    """Solve a list with problems of another law, without starts, between the worlds; return the worlds' solutions."""
     law = LAWS[LAWS.index(worlds[0].law) - 1]
     others = draw_worlds(len(worlds[0].free), len(worlds), law, nv=len(worlds[0].free))
     problems = [w.make_problem() for both in zip(worlds, others, strict=True) for w in both]
